@@ -25,6 +25,8 @@ from depthpose.cli.option_rules import (
 from depthpose.core.errors import InputError
 
 IGNORED = [
+    ("depth match", "l r --camera c --min-confidence 0.9", "--min-confidence"),
+    ("data make objects", "--pile 3 --clutter 4 4", "--clutter"),
     ("pose predict", "--method register --cad p.stl --weights parts", "--weights"),
     ("pose predict", "--voting least-squares --method=register", "--voting"),
     ("pose track", "--method register --weights ycb", "--weights"),
@@ -78,6 +80,8 @@ REFUSED = [
     ("reproduce 3.2", "--bop b", "there is nothing to measure; give --weights FILE or --csv"),
 ]
 USED = [
+    ("depth match", "l r --camera c --cloud --min-confidence 0.9"),
+    ("pose evaluate", "--bop b --weights registered.safetensors --voting ransac"),
     ("depth predict", "--engine ray --matcher sgbm a.png b.png"),
     ("pose predict", "--bop d --camera None"),
     ("pose predict", "--bop d --method register --masks seg.safetensors --device cuda"),
@@ -155,8 +159,11 @@ def test_the_command_refuses_it_in_a_line(capsys: pytest.CaptureFixture[str]) ->
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("depth match l r --camera c --min-confidence 2", "--min-confidence 2: give 0 to 1"),
-        ("depth predict l --min-confidence -1", "--min-confidence -1: give 0 to 1"),
+        (
+            "depth match l r --camera c --cloud --min-confidence 2",
+            "--min-confidence 2: give 0 to 1",
+        ),
+        ("depth predict l --cloud --min-confidence -1", "--min-confidence -1: give 0 to 1"),
         ("depth predict l --batch 0", "--batch 0: give 1 or more"),
         ("depth predict l --engine ray --worker-gpus -1 --device cuda", "--worker-gpus -1.0: give"),
         ("depth predict l --engine ray --workers 0", "--workers 0: give 1 or more"),

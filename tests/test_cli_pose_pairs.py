@@ -96,6 +96,32 @@ def test_a_pair_becomes_a_pose(
     assert (out / DEPTH / "left.npy").stat().st_mtime_ns == before, "a rerun keeps what is there"
 
 
+@pytest.mark.slow
+def test_a_pair_that_fails_is_named_and_stops_no_other(
+    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        content = (pair / f"{side}.png").read_bytes()
+        (tmp_path / side / "good.png").write_bytes(content)
+        (tmp_path / side / "torn.png").write_bytes(content[: None if side == "left" else 5000])
+    out = tmp_path / "out"
+    views = ["--left", str(tmp_path / "left"), "--right", str(tmp_path / "right")]
+    words = ["--camera", str(pair / "rig.json"), "--matcher", "sgbm", "--out", str(out)]
+    words += ["--cad", str(pair / "bracket.stl"), "--unit", "mm", "--box", "150,100,500,400"]
+    assert main(["pose", "predict", *views, *words]) == 1
+    assert "depthpose: failed:" in capsys.readouterr().err
+    assert {row["name"] for row in json.loads((out / "poses.json").read_text())} == {"good"}
+
+    # Another pair in the same folder: the one before is not posed again.
+    for side in ("left", "right"):
+        (tmp_path / side / "torn.png").unlink()
+        (tmp_path / side / "good.png").rename(tmp_path / side / "other.png")
+        (tmp_path / side / "more.png").write_bytes((tmp_path / side / "other.png").read_bytes())
+    assert main(["pose", "predict", *views, *words]) == 0
+    assert {path.stem for path in (out / DEPTH).glob("*.npy")} == {"other", "more"}
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

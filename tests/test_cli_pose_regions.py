@@ -184,6 +184,33 @@ def test_a_folder_of_yolo_s_text_is_posed(
     assert any("nothing of it is detected" in cell for cell in page.texts["td"])
 
 
+@pytest.mark.parametrize("damaged", ["depth", "mask"])
+def test_a_damaged_file_stops_no_other(scene: Scene, tmp_path: Path, damaged: str) -> None:
+    words, masks = scene
+    depth = tmp_path / "depth"
+    good = (depth / "000012.png").read_bytes()
+    (depth / "000013.png").write_bytes(good[:2000] if damaged == "depth" else good)
+    words[-1] = str(depth)
+    (tmp_path / "regions").mkdir()
+    if damaged == "depth":
+        x0, y0, x1, y1 = edges(masks["bracket"])
+        shares = ((x0 + x1) / 640, (y0 + y1) / 480, (x1 - x0) / 320, (y1 - y0) / 240)
+        for name in ("000012", "000013"):
+            line = " ".join(map(str, (0, *shares, 0.9)))
+            (tmp_path / "regions" / f"{name}.txt").write_text(line)
+        words += ["--detections", str(tmp_path / "regions"), "--labels", "0=bracket"]
+        good_name, bad_name = "000012", "000013"
+    else:
+        Image.fromarray(masks["bracket"].byte().numpy() * 4).save(tmp_path / "regions/000012.png")
+        (tmp_path / "regions/000013.png").write_bytes(b"torn")
+        words += ["--mask", str(tmp_path / "regions"), "--labels", "4=bracket"]
+        good_name, bad_name = "000012_4", "000013_4"
+    assert main(words) == 1
+    rows = answers(tmp_path)
+    assert rows.pop(bad_name)["status"] == "unreadable"
+    assert_right(rows, {good_name: "bracket"})
+
+
 def test_what_a_detector_did_not_find_has_a_row(scene: Scene, tmp_path: Path) -> None:
     words, masks = scene
     file = tmp_path / "found.json"

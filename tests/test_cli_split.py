@@ -66,6 +66,21 @@ def test_views_are_parted(
         assert float((parted - view).abs().mean()) < 0.02
 
 
+def test_a_picture_of_the_same_name_replaces_no_other(
+    tmp_path: Path, views: tuple[torch.Tensor, torch.Tensor], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder, pair in (("a", views), ("b", views[::-1])):
+        (tmp_path / folder).mkdir()
+        write_image(tmp_path / folder / "pic.png", torch.cat(pair, 2))
+    words = ["data", "split", "--out", str(tmp_path / "out")]
+    first = str(tmp_path / "a/pic.png")
+    assert main([*words, first]) == main([*words, first]) == 0
+    before = (tmp_path / "out/left/pic.png").read_bytes()
+    assert main([*words, str(tmp_path / "b/pic.png")]) == 2
+    assert "pic" in capsys.readouterr().err
+    assert (tmp_path / "out/left/pic.png").read_bytes() == before
+
+
 def test_one_view_is_not_parted(
     tmp_path: Path, views: tuple[torch.Tensor, torch.Tensor], capsys: pytest.CaptureFixture[str]
 ) -> None:

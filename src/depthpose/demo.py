@@ -14,6 +14,7 @@ from torch import Tensor
 from depthpose.core.camera import Camera, StereoRig, back_project, write_camera
 from depthpose.core.draw import draw_depth
 from depthpose.core.environment import describe_environment
+from depthpose.core.errors import InputError
 from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid
 from depthpose.core.run_folder import claim_folder
@@ -307,6 +308,11 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     """
     # A frame that shows each part once, and two other things, from 0.6 to 0.9 m away.
     net = GeoPoseNet.load(weights)
+    if _SAMPLE not in net.objects:
+        raise InputError(
+            f"--pose-weights {weights}: the demo shows {_SAMPLE!r} among other parts, and these "
+            f"weights know {', '.join(net.objects)}; take parts"
+        )
     models = {model.number: model for model in net.weights.models}
     count = len(models)
     config = ObjectsConfig(

@@ -55,6 +55,11 @@ def has_word(name: str, word: str) -> Condition:
     return lambda typed: word in typed[name]
 
 
+def all_are(name: str, word: str) -> Condition:
+    """Make the condition that an option has words, all of which are this one."""
+    return lambda typed: bool(typed[name]) and set(typed[name]) == {word}
+
+
 def all_begin(name: str, *prefixes: str) -> Condition:
     """Make the condition that an option has words, all of which begin with one of the prefixes."""
     return lambda typed: (
@@ -370,13 +375,13 @@ IGNORED_RULES = (
     ),
     IgnoredRule(
         commands=("pose evaluate",),
-        when=all_begin("weights", "register"),
+        when=all_are("weights", "register"),
         ignored=("voting",),
         reason="register does not vote",
     ),
     IgnoredRule(
         commands=("pose evaluate",),
-        when=both(all_begin("weights", "register"), _is_nothing_segmented),
+        when=both(all_are("weights", "register"), _is_nothing_segmented),
         ignored=("device",),
         reason="register computes on the processor",
     ),
@@ -397,6 +402,18 @@ IGNORED_RULES = (
         when=_is_on_ray,
         ignored=("one-mount",),
         reason="it takes images one after the other, and workers do not; leave --engine out",
+    ),
+    IgnoredRule(
+        commands=("depth match", "depth predict"),
+        when=lambda typed: "cloud" not in typed,
+        ignored=("min-confidence",),
+        reason="it leaves points out of a cloud, and none is written; add --cloud",
+    ),
+    IgnoredRule(
+        commands=("data make objects",),
+        when=any_typed("pile"),
+        ignored=("clutter",),
+        reason="a pile has nothing beside it; omit --pile",
     ),
     IgnoredRule(
         commands=("depth predict",),

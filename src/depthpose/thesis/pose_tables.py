@@ -140,7 +140,14 @@ def join_by_object(
     our_rows = [_make_our_row(group, columns) for group in groups.values()]
     names = list(columns.values())
     if not with_published:
-        differences = [_subtract_row(our_rows[0], other, names) for other in our_rows[1:]]
+        # Of the same kind of masks: those of the first method less those of each other.
+        first = our_rows[0]["method"]
+        differences = [
+            _subtract_row(row, other, names)
+            for row in our_rows
+            for other in our_rows
+            if row["method"] == first != other["method"] and row["masks"] == other["masks"]
+        ]
         return [*our_rows, *differences]
 
     # The printed ones before them, and the differences to our peers after.

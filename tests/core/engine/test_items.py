@@ -64,6 +64,12 @@ def test_a_manifest_that_cannot_be_used_says_why(tmp_path: Path, table: str, sai
         list_inputs([str(tmp_path / "list.csv")], ONE)
 
 
+def test_a_manifest_without_a_line_names_nothing(tmp_path: Path) -> None:
+    (tmp_path / "list.csv").write_text("text\n")
+    with pytest.raises(InputError, match=r"list\.csv: name no input; a manifest needs a line"):
+        JobInputs.find([str(tmp_path / "list.csv")], ONE)
+
+
 def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
     folders = [str(write_texts(tmp_path / f, {"same": ""})) for f in "ab"]
     with pytest.raises(InputError, match="give a manifest with a column 'name'"):

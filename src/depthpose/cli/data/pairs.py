@@ -130,10 +130,19 @@ def split_pairs(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -
     from depthpose.cli.depth.inputs import list_images_and_videos
     from depthpose.core.camera import order_views
     from depthpose.core.files import write_image
-    from depthpose.core.run_folder import claim_folder
+    from depthpose.core.files.disk import refuse_equal_stems
+    from depthpose.core.run_folder import claim_folder, claim_names
 
     sources = list_images_and_videos(files, out)
+    refuse_equal_stems(sources)
     claim_folder(out, {"command": "data split"}, _SIDES)
+
+    def is_split(name: str) -> bool:
+        """Whether an earlier run wrote the views of a picture, or of a video's first frame."""
+        files = (f"{name}.png", f"{name}_000000.png")
+        return any((out / _SIDES[0] / file).is_file() for file in files)
+
+    claim_names(out, {source.stem: source for source in sources}, is_finished=is_split)
     count = 0
     for source in sources:
         for name, images in _read_two_view_pictures(source):

@@ -64,12 +64,14 @@ def predict_poses(
     )
 
     # A pair is matched first, to depth images in metres.
+    matching_code = 0
     if pair.left is not None:
         from depthpose.cli.pose.pairs import match_pairs_for_poses
 
-        depth = match_pairs_for_poses(pair, pose_inputs.camera, estimates.device, Path(out))
+        matched = match_pairs_for_poses(pair, pose_inputs.camera, estimates.device, Path(out))
+        matching_code = matched.exit_code
         cad_unit = pose_inputs.cad_unit or pose_inputs.unit
-        pose_inputs = replace(pose_inputs, depth=str(depth), unit=None, cad_unit=cad_unit)
+        pose_inputs = replace(pose_inputs, depth=str(matched.depth), unit=None, cad_unit=cad_unit)
 
     batch = estimates.batch
     if engine.engine == "ray":
@@ -90,8 +92,10 @@ def predict_poses(
             "--depth, --mask and --camera, or weights that vote"
         )
     if pose_inputs.depth is not None and not pose_inputs.has_regions:
-        return search_files(method, pose_inputs, out_folder)
-    return predict_poses_of_files(method, pose_inputs, out_folder, batch)
+        code = search_files(method, pose_inputs, out_folder)
+    else:
+        code = predict_poses_of_files(method, pose_inputs, out_folder, batch)
+    return max(code, matching_code)
 
 
 def evaluate_poses(

@@ -8,11 +8,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Int64
 from torch import Tensor
 
 from depthpose.core.camera import AnyLens
 from depthpose.core.errors import InputError
-from depthpose.core.files import CLOUD_READERS, MAP_SUFFIXES, list_images, read_stored_depth
+from depthpose.core.files import (
+    CLOUD_READERS,
+    MAP_SUFFIXES,
+    image_size,
+    list_images,
+    read_stored_depth,
+)
 from depthpose.core.files.disk import natural_sort_key, refuse_equal_stems
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.units import Unit
@@ -136,9 +143,8 @@ class _MaskPart(NamedTuple):
 def _split_by_number(mask: Path, object: str) -> list[_MaskPart]:
     """Split a mask by its numbers, all of one object; a mask with one number stays whole."""
     whole_mask = [_MaskPart(ending="", object=object, mask=mask)]
-    try:
-        label_map = read_labels(mask)
-    except InputError:  # the job reads the mask again, and is the one to fail
+    label_map = _try_read_labels(mask)
+    if label_map is None:  # the job reads the mask again, and is the one to fail
         return whole_mask
     numbers = label_map[label_map != 0].unique().tolist()
     if len(numbers) <= 1:
@@ -162,15 +168,25 @@ def _split_by_label(mask: Path, labels: Mapping[str, str], wanted: str | None) -
             "1=OBJECT,2=OBJECT"
         )
     objects = {int(label): name for label, name in labels.items()}
-    label_map = read_labels(mask, list(objects))
+    is_readable = _try_read_labels(mask) is not None
+    label_map = read_labels(mask, list(objects)) if is_readable else None
     parts: list[_MaskPart] = []
     for number in sorted(objects):
         object = objects[number]
         is_left_out = not object  # "3=" leaves number 3 out
         if not is_left_out and wanted in (None, object):
-            part_mask = _encode_run_lengths(label_map == number)
+            # A job reads a mask that cannot be read again, and is the one to fail.
+            part_mask = mask if label_map is None else _encode_run_lengths(label_map == number)
             parts.append(_MaskPart(ending=f"_{number}", object=object, mask=part_mask))
     return parts
+
+
+def _try_read_labels(mask: Path) -> Int64[Tensor, "h w"] | None:
+    """Read the numbers of a mask; None where it cannot be read."""
+    try:
+        return read_labels(mask)
+    except InputError:
+        return None
 
 
 def _encode_run_lengths(pixels: Tensor) -> AnyMask:
@@ -273,8 +289,11 @@ def _read_detections_of(depth: Path, file: Path) -> list[Detection]:
     """Read the detections of one depth image; YOLO's text files need its size for their shares."""
     size = None
     if file.suffix.lower() == ".txt":
-        height, width = read_stored_depth(depth).shape
-        size = (width, height)
+        if depth.suffix.lower() in MAP_SUFFIXES:
+            height, width = read_stored_depth(depth).shape
+            size = (width, height)
+        else:  # without its pixels, which may be damaged: the job reads them
+            size = image_size(depth)
     return read_detections(file, size)
 
 

@@ -19,7 +19,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_cloud, write_image
 from depthpose.core.processes import find_rank
 from depthpose.core.rigid import Rigid
-from depthpose.core.run_folder import is_whole, note_result
+from depthpose.core.run_folder import note_result
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.footprint import explained_mask
 from depthpose.pose.inputs import AnyInput
@@ -180,9 +180,8 @@ def _write_dataset_files(
         if prediction.place is not None and prediction.estimate.is_posed:
             posed[prediction.place[:2]].append(prediction.estimate)
     for (scene_id, image_id), estimates in posed.items():
+        # Drawn anew, for this run may have posed more of its objects.
         name = f"{scene_id:06d}_{image_id:06d}.{PICTURE}"
-        if is_whole(out, name, [name]):
-            continue
         instance = image_of[scene_id, image_id]
         picture = pose_report.read_instance_image(instance)
         for estimate in estimates:

@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
@@ -27,12 +28,21 @@ DEVIATION = "depth_std"
 """Folder of the standard deviation of that depth."""
 
 
-def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, out: Path) -> Path:
+class MatchedPairs(NamedTuple):
+    """Pairs as depth images."""
+
+    depth: Path  #: OUT/depth/NAME.npy of a single pair, or the folder OUT/depth of several
+    exit_code: int  #: 1 where some pairs have no depth
+
+
+def match_pairs_for_poses(
+    pair: PairOptions, camera: Path | None, device: str, out: Path
+) -> MatchedPairs:
     """Match pairs, and write their depth as input of an estimate of poses.
 
     OUT/matched gets what 'depth match' writes, OUT/depth the depth [m] whose confidence is
     ``pair.min_confidence`` at least, and OUT/depth_std its standard deviation [m]. A rerun does not
-    match again.
+    match again. A pair without depth that is sure enough is named, and stops no other.
 
     Args:
         pair: left and right images, what matches them, and the least confidence.
@@ -40,11 +50,9 @@ def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, o
         device: device that the matcher runs on.
         out: folder of the run.
 
-    Returns:
-        The depth image OUT/depth/NAME.npy of a single pair, or the folder OUT/depth of several.
-
     Raises:
-        InputError: an image has no partner, a camera no baseline, or no depth is sure enough.
+        InputError: an image has no partner, a camera no baseline, or no pair has depth that is sure
+            enough.
     """
     assert pair.left is not None
     assert pair.right is not None
@@ -55,16 +63,33 @@ def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, o
     spec = make_pair_spec(pair.matcher, "default", MatcherConfig(device=device))
     rig = read_rig(camera, image_size(pairs[0][0]))
     reader = InputReader(camera=rig, files=PAIRS)
-    predict_depth_of_files(pairs, spec.build(), reader, PredictOutput(), out / MATCHED)
+    exit_code = predict_depth_of_files(pairs, spec.build(), reader, PredictOutput(), out / MATCHED)
     if find_rank().world > 1:  # every process poses its share of all pairs
         wait_for_results(pairs, out / MATCHED, with_cloud=False)
 
     names = [left.stem for left, _ in pairs]
+    failures: list[InputError] = []
     for name in names:
-        _write_sure_depth(name, rig, pair.min_confidence, out)
+        try:
+            _write_sure_depth(name, rig, pair.min_confidence, out)
+        except InputError as failure:
+            failures.append(failure)
+    if failures and len(failures) == len(names):
+        raise failures[0]
+    for failure in failures:
+        print(f"depthpose: failed: {failure}", file=sys.stderr)
+        exit_code = 1
     if len(names) == 1:  # a single depth image may have a mask of any name
-        return out / DEPTH / f"{names[0]}.npy"
-    return out / DEPTH
+        return MatchedPairs(out / DEPTH / f"{names[0]}.npy", exit_code)
+
+    if not any((out / DEPTH / f"{name}.npy").is_file() for name in names):
+        raise InputError(f"{pair.left}: no pair has depth, for the reasons above; correct these")
+
+    # The depth of other pairs, by an earlier run here, is not posed again.
+    for path in (out / DEPTH).glob("*.npy"):
+        if path.stem not in names:
+            path.unlink(missing_ok=True)
+    return MatchedPairs(out / DEPTH, exit_code)
 
 
 def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Path) -> None:

@@ -121,10 +121,18 @@ def _build_methods(
     # Methods beside them reproduce no row of the thesis.
     if not table.with_right:
         files = ("default",) if beside is None else beside
+        sha256_of_name = {method.name: method.settings["weights_sha256"] for _, method in methods}
         for file in files:
             method = DepthNetworkSpec(weights=file, config=config, with_right=False).build()
+            sha256 = method.settings["weights_sha256"]
+            if sha256_of_name.setdefault(method.name, sha256) != sha256:
+                raise InputError(
+                    f"--beside {file}: two weights are called {method.name!r}, and so would their "
+                    "predictions be: rename one."
+                )
             if method.name not in names:
                 methods.append(("", method))
+                names.append(method.name)
     return methods
 
 

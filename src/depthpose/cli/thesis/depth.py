@@ -193,17 +193,13 @@ def find_frames(dataset: Dataset, names: Sequence[str]) -> list[int]:
 
 
 def choose_frames(dataset: Dataset, count: int) -> list[int]:
-    """Choose frames with a right view, spread over the dataset; return their indices.
+    """Choose frames, spread over the dataset; return their indices.
 
-    They have LiDAR too, if any frame has both.
-
-    Raises:
-        InputError: no frame has a right view.
+    They have a right view if any frame has one, and LiDAR too, if any such frame has.
     """
-    pairs = [i for i, frame in enumerate(dataset.frames) if frame.right is not None]
+    frames = range(len(dataset.frames))
+    pairs = [i for i in frames if dataset.frames[i].right is not None] or list(frames)
     candidates = [i for i in pairs if has_lidar(dataset.frames[i], "camera_z")] or pairs
-    if not candidates:
-        raise InputError(f"{dataset.name}: no frame has a right view, which the figures show.")
     return [candidates[k] for k in page.spread_evenly(len(candidates), max(1, count))]
 
 

@@ -277,6 +277,8 @@ class JobInputs:
             for url in stores.list_files(word, (".tar", ".tgz", ".gz")):
                 if url.lower().endswith(_TAR_SUFFIXES):
                     tars[url] = None
+        if not listed and not tars:
+            raise InputError(f"{', '.join(words)}: name no input; a manifest needs a line for each")
         return cls(listed=listed, tars=list(tars), input_format=input_format)
 
     @contextmanager
