@@ -81,6 +81,18 @@ def test_a_rerun_does_what_is_missing_and_nothing_else(tmp_path: Path) -> None:
     assert list(unpacked(tmp_path / "out")) == list("abcdef")
 
 
+def test_what_is_made_from_a_changed_input_is_made_anew(tmp_path: Path) -> None:
+    folder = write_texts(tmp_path / "in", {name: name * 3 for name in "abcd"})
+    job = job_of(tmp_path, [str(folder)])
+    run_job(job, InProcessEngine())
+    changed = write_texts(folder, {"c": "new"}) / "c.txt"
+    after_ns = (tmp_path / "out/shards/000001.tar").stat().st_mtime_ns + 1_000_000
+    os.utime(changed, ns=(after_ns, after_ns))
+    run_job(job, InProcessEngine())
+    assert calls(tmp_path) == ["start", "a", "b", "c", "d", "start", "c", "d"]
+    assert unpacked(tmp_path / "out")["c"]["back.txt"] == b"wen"
+
+
 def test_a_shard_without_its_record_is_written_anew(tmp_path: Path) -> None:
     folder = write_texts(tmp_path / "in", {"a": "one"})
     job = job_of(tmp_path, [str(folder)])

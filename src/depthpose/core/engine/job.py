@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from depthpose.core.engine.inputs import PLAN, Block, ListedInput, plan_blocks, read_tar
@@ -111,7 +112,7 @@ def _find_finished(out: str, blocks: Sequence[Block]) -> dict[str, ShardRecord]:
 def _is_shard_whole(
     folder: str, block: Block, record: ShardRecord, sizes: Mapping[str, int]
 ) -> bool:
-    """Whether a shard is of this block and as it was written.
+    """Whether a shard is of this block, as it was written, and no older than what it is made from.
 
     In an object store only its size is compared, by ``sizes``: those of the files of the folder.
     """
@@ -120,7 +121,16 @@ def _is_shard_whole(
     path = stores.local_path(stores.join(folder, record.shard))
     if path is None:
         return sizes.get(record.shard) == record.stamp[0]
-    return is_unchanged(path, record.stamp)
+    return is_unchanged(path, record.stamp) and not _has_newer_input(block, path)
+
+
+def _has_newer_input(block: Block, shard: Path) -> bool:
+    """Whether a local input of a block was changed after the shard of its results was written."""
+    urls = [file for listed in block.listed for file in listed.files]
+    urls += [] if block.tar is None else [block.tar]
+    paths = [path for url in urls if (path := stores.local_path(url)) is not None]
+    written_ns = shard.stat().st_mtime_ns
+    return any(path.is_file() and path.stat().st_mtime_ns > written_ns for path in paths)
 
 
 def _write_manifest(out: str, records: Sequence[ShardRecord]) -> None:
