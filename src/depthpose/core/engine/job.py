@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from depthpose.core.engine.inputs import PLAN, Block, ListedInput, plan_blocks, read_tar
@@ -121,15 +120,16 @@ def _is_shard_whole(
     path = stores.local_path(stores.join(folder, record.shard))
     if path is None:
         return sizes.get(record.shard) == record.stamp[0]
-    return is_unchanged(path, record.stamp) and not _has_newer_input(block, path)
+    # Copied, a shard may be older or newer than when it was written.
+    written_ns = max(record.stamp[1], path.stat().st_mtime_ns) if path.is_file() else 0
+    return is_unchanged(path, record.stamp) and not _has_newer_input(block, written_ns)
 
 
-def _has_newer_input(block: Block, shard: Path) -> bool:
-    """Whether a local input of a block was changed after the shard of its results was written."""
+def _has_newer_input(block: Block, written_ns: int) -> bool:
+    """Whether a local input of a block was changed after its results were written."""
     urls = [file for listed in block.listed for file in listed.files]
     urls += [] if block.tar is None else [block.tar]
     paths = [path for url in urls if (path := stores.local_path(url)) is not None]
-    written_ns = shard.stat().st_mtime_ns
     return any(path.is_file() and path.stat().st_mtime_ns > written_ns for path in paths)
 
 
