@@ -258,6 +258,7 @@ def test_a_model_of_points_is_drawn_in_a_frame() -> None:
     frame = next(make_frames([of_points], _FRAME, 1))
     shown = frame.objects[0].visible
     assert int(shown.sum()) > 50
+    assert frame.rgb is not None
     assert float(frame.rgb[:, shown].std()) > 0.01, "it is shaded"
 
 
