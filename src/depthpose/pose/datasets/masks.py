@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64, Num
+from jaxtyping import Bool, Int64, Shaped
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -133,7 +133,7 @@ def _read_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
     return pixels
 
 
-def object_numbers(values: Num[Tensor, "h w"], name: str) -> Int64[Tensor, "h w"]:
+def object_numbers(values: Shaped[Tensor, "h w"], name: str) -> Int64[Tensor, "h w"]:
     """Convert the numbers of a mask to whole ones; fractions are probabilities of an object.
 
     Those above a half are the object, 1; other pixels are 0.

@@ -137,7 +137,7 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
 
 
 def assign_symmetries(
-    declared: AnySymmetry | Mapping[str, AnySymmetry] | Sequence[str] | None, names: Sequence[str]
+    declared: AnySymmetry | Mapping[Any, AnySymmetry] | Sequence[str] | None, names: Sequence[str]
 ) -> dict[str, AnySymmetry]:
     """Find for each declared symmetry the object that has it.
 
