@@ -165,7 +165,7 @@ def _complete_group(turns: list[Rigid]) -> list[Rigid]:
         for second in turns:
             product = first @ second
             rotations = torch.stack([_EYE, *(turn.R for turn in group)])
-            if float(geodesic_rad(product.R, rotations).min()) > same_rad:
+            if float(geodesic_rad(product.R.expand_as(rotations), rotations).min()) > same_rad:
                 group.append(product)
         if len(group) > _MOST_GROUP:
             return turns
