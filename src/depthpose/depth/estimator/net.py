@@ -220,6 +220,11 @@ class FakestereoNet:
         # The weights that are named, as generator and matcher.
         if weights is None and matcher is None:
             weights = DEFAULT
+        if weights is None and answer is not None:
+            raise InputError(
+                f"answer is {answer!r}, and a matcher alone estimates no single image; give the "
+                "weights of a generator, or omit answer"
+            )
         loaded = None
         loaded_matcher = None
         loaded_files: list[tuple[str, DepthWeights]] = []
