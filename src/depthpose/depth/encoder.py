@@ -96,12 +96,12 @@ class MixedStyle(nn.Module):
         # Mixed with those of another image, and changed at random.
         batch, channels = features.shape[:2]
         other = torch.randperm(batch)
-        own_share = torch.distributions.Beta(self._BETA, self._BETA).sample((batch, 1, 1, 1))
-        own_share = own_share.to(features)
+        kept_share = torch.distributions.Beta(self._BETA, self._BETA).sample((batch, 1, 1, 1))
+        kept_share = kept_share.to(features)
         gain = (self._GAIN_STD * torch.randn(batch, channels, 1, 1)).exp().to(features)
         shift = (self._SHIFT_STD * torch.randn(batch, channels, 1, 1)).to(features)
-        new_std = own_share * std + (1 - own_share) * std[other]
-        new_mean = own_share * mean + (1 - own_share) * mean[other] + shift * new_std
+        new_std = kept_share * std + (1 - kept_share) * std[other]
+        new_mean = kept_share * mean + (1 - kept_share) * mean[other] + shift * new_std
         return (features - mean) / std * (gain * new_std) + new_mean
 
 

@@ -528,6 +528,10 @@ def label_regions(
     return torch.from_numpy(label).reshape(depth_m.shape)
 
 
+# The half of the eight neighbours that a scan by rows meets before the pixel: (row, column) steps.
+_EARLIER_NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1))
+
+
 @compiled
 def _label_regions(
     depth_m: Float64[np.ndarray, "h w"], is_counted: Bool[np.ndarray, "h w"]
@@ -539,10 +543,9 @@ def _label_regions(
         for column in range(width):
             if not is_counted[row, column]:
                 continue
-            # The neighbours before it: above on the left, above, above on the right, on the left.
-            for neighbour in range(4):
-                other_row = row - 1 if neighbour < 3 else row
-                other_column = column - 1 + neighbour if neighbour < 3 else column - 1
+            for row_step, column_step in _EARLIER_NEIGHBOURS:
+                other_row = row + row_step
+                other_column = column + column_step
                 if other_row < 0 or other_column < 0 or other_column >= width:
                     continue
                 if not is_counted[other_row, other_column]:
