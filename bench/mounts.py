@@ -37,9 +37,9 @@ from shared import group_rows, make_parser, mean_of
 from depthpose.core.camera import Camera, StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.depth.config import MatcherConfig, SelectionConfig
+from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.single_image import depth_before_mount
+from depthpose.depth.estimator.single_image import depth_from_images
 from depthpose.depth.ground import fit_ground
 from depthpose.depth.mount import MountFilter, scale_by_mount
 from depthpose.depth.synthetic.sensor import draw_sensors, expose
@@ -349,19 +349,15 @@ def measure_view(view: View, net: FakestereoNet, mount_filter: MountFilter) -> l
     camera = view.image.camera
     assert camera is not None
     assert net.synthesiser is not None
-    sizes = net.virtual_sizes(view.image)
-    (unscaled,) = depth_before_mount(
-        net.synthesiser, net.matcher, [view.image], sizes, allow_ood=True
-    )
+    (unscaled,) = depth_from_images(net.synthesiser, net.matcher, [view.image], allow_ood=True)
     config = net.synthesiser.config
-    assert isinstance(config, SelectionConfig)
-    without_mount = scale_by_mount(unscaled, view.image, None, config)
+    without_mount = scale_by_mount(unscaled, None, config)
 
     def corrected(way: str) -> DepthEstimate:
         if way == "map":
             return unscaled
         if way == "frames":
-            return scale_by_mount(unscaled, view.image, mount_filter, config)
+            return scale_by_mount(unscaled, mount_filter, config)
         if way == "nothing" or view.mount is None:
             return without_mount
         height_m, tilt_deg = view.mount
@@ -369,7 +365,8 @@ def measure_view(view: View, net: FakestereoNet, mount_filter: MountFilter) -> l
         if way == "height and tilt":
             mounted = replace(mounted, tilt_deg=tilt_deg)
         try:
-            return scale_by_mount(unscaled, replace(view.image, camera=mounted), None, config)
+            by_mount = replace(unscaled, input=replace(view.image, camera=mounted))
+            return scale_by_mount(by_mount, None, config)
         except InputError:
             return without_mount
 

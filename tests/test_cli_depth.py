@@ -38,7 +38,7 @@ from depthpose.core.files import (
     write_video,
 )
 from depthpose.core.loop import Progress, read_metrics
-from depthpose.depth.estimator import single_image
+from depthpose.depth.estimator import net
 from depthpose.depth.stereo import Matcher, PSMNet, SGBMMatcher
 from depthpose.depth.synthesis import Synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
@@ -311,18 +311,21 @@ def test_a_frame_of_a_video_that_is_refused_leaves_the_others(
     frames = [torch.full((3, 48, 64), 0.2 + 0.1 * k) for k in range(4)]
     write_video(tmp_path / "drive.avi", frames, 5.0)
     refused = InputError("drive_000001: a black frame")
-    estimate = single_image.depth_before_mount
+    estimate = net.depth_from_images
 
     def refuse_one(
-        synthesiser: Synthesiser, matcher: Matcher | None, images: Sequence[StereoInput],
-        sizes: Sequence[tuple[int, int]], *, allow_ood: bool,
-    ) -> list[DepthEstimate]:  # fmt: skip
+        synthesiser: Synthesiser,
+        matcher: Matcher | None,
+        images: Sequence[StereoInput],
+        *,
+        allow_ood: bool,
+    ) -> list[DepthEstimate]:
         if any(image.name == "drive_000001" for image in images):
             raise refused
-        return estimate(synthesiser, matcher, images, sizes, allow_ood=allow_ood)
+        return estimate(synthesiser, matcher, images, allow_ood=allow_ood)
 
     out = tmp_path / "out"
-    with patch.object(single_image, "depth_before_mount", refuse_one):
+    with patch.object(net, "depth_from_images", refuse_one):
         assert predict(home, out, str(tmp_path / "drive.avi"), "--focal-px", "70") == 1
     assert "failed: drive_000001: a black frame" in capsys.readouterr().err
     assert len(list(out.glob("*.depth_m.npy"))) == 3
@@ -335,19 +338,22 @@ def roads() -> Iterator[None]:
     """Let networks see a road in every image, as high and tilted as its name says."""
 
     def estimate(
-        synthesiser: Synthesiser, matcher: Matcher | None, images: Sequence[StereoInput],
-        sizes: Sequence[tuple[int, int]], *, allow_ood: bool,
-    ) -> list[DepthEstimate]:  # fmt: skip
+        synthesiser: Synthesiser,
+        matcher: Matcher | None,
+        images: Sequence[StereoInput],
+        *,
+        allow_ood: bool,
+    ) -> list[DepthEstimate]:
         estimates: list[DepthEstimate] = []
         for image in images:
             number = int(image.name[-1])
             rows = (torch.arange(48.0) - 23.5) / 70
             inverse = (rows + math.tan(math.radians(2 + 0.5 * number))) / (1.5 + 0.1 * number)
             depth_m = (1 / inverse.clamp(min=1 / 60))[:, None].expand(48, 64).contiguous()
-            estimates.append(DepthEstimate(depth_m=depth_m, disparity_px=35 / depth_m))
+            estimates.append(DepthEstimate(input=image, depth_m=depth_m, disparity_px=35 / depth_m))
         return estimates
 
-    with patch.object(single_image, "depth_before_mount", estimate):
+    with patch.object(net, "depth_from_images", estimate):
         yield
 
 

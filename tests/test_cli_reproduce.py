@@ -42,7 +42,7 @@ class FlatMono:
         depth_m = torch.full(pair.left.shape[1:], self.depth_m if is_mono else 2 * self.depth_m)
         disparity_px = disparity_from_depth(depth_m, pair.camera)
         right = pair.left if is_mono else None
-        return DepthEstimate(depth_m=depth_m, disparity_px=disparity_px, right=right)
+        return DepthEstimate(input=pair, depth_m=depth_m, disparity_px=disparity_px, right=right)
 
 
 @pytest.fixture(scope="module")

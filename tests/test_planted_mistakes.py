@@ -24,9 +24,10 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png
 from depthpose.core.files.images import check_image
 from depthpose.core.units import Unit
-from depthpose.depth.disparity import disparity_from_depth, find_unit_mistake
+from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.estimator import check_pair
 from depthpose.depth.types import StereoInput
+from depthpose.depth.unit_mistakes import find_unit_mistake
 from depthpose.pose.cloud import prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig
 from depthpose.pose.inputs import AnyInput, cloud_input, view_input

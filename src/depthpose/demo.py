@@ -22,7 +22,7 @@ from depthpose.depth.config import COLOR_RANGE_M, SGBMConfig, StreetsConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.metrics import measure
-from depthpose.depth.predictions import CLOUD_M, write_estimate
+from depthpose.depth.predictions import CLOUD_M, OutputOptions, write_estimate
 from depthpose.depth.protocols import clamped_depth_from_disparity
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthError, DepthEstimate, StereoInput, StereoSample, StereoTruth
@@ -186,7 +186,8 @@ def _show_scene(
     for method in methods:
         net_input = pair if method.views == _FROM_PAIR else replace(pair, right=None)
         estimate = method.net.estimate_input(net_input)
-        write_estimate(_name_folder(out, method), net_input, estimate, range_m, CLOUD_M)
+        options = OutputOptions(range_m=range_m, cloud_m=CLOUD_M)
+        write_estimate(_name_folder(out, method), estimate, options)
         origin = {"scene": pair.name, "method": method.name, "input": method.views}
         rows.append(origin | _measure_depth(estimate, scene.sample))
 
@@ -195,7 +196,7 @@ def _show_scene(
         error = DepthError(error=error_px, is_disparity=True)
         title = f"{pair.name}: {method.name}, {method.views}"
         section = make_depth_section(
-            title, net_input, estimate, range_m=range_m, error=error, with_image=False
+            title, estimate, range_m=range_m, error=error, with_image=False
         )
         sections.append(section)
 

@@ -17,9 +17,9 @@ class Lengths(Results[str, int]):
     def is_finished(self, job: Job[str]) -> bool:
         return job.name in self.stored
 
-    def store(self, job: Job[str], data: str, result: int) -> None:
+    def store(self, job: Job[str], result: int) -> None:
         if result > 5:
-            raise InputError(f"{data}: too long")
+            raise InputError(f"{job.name}: too long")
         self.stored[job.name] = result
 
     def store_failure(self, job: Job[str], error: InputError) -> None:

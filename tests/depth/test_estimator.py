@@ -115,14 +115,17 @@ def test_an_estimate_is_one_readable_line() -> None:
     depth_m = torch.full((20, 30), 4.0)
     depth_m[:10], depth_m[0], depth_m[1, 1] = 12, torch.nan, 45_399  # one pixel is far away
     px, sky = torch.full((20, 30), 8.0), torch.arange(20)[:, None].expand(20, 30) < 1
-    whole = DepthEstimate(depth_m=depth_m, disparity_px=px, confidence=px / 16, is_sky=sky)
+    seen = StereoInput(name="a", left=torch.zeros(3, 20, 30), right=None, camera=None)
+    whole = DepthEstimate(
+        input=seen, depth_m=depth_m, disparity_px=px, confidence=px / 16, is_sky=sky
+    )
     assert repr(whole) == (
         "DepthEstimate(30x20, depth 4.0 .. 12.0 m (1 to 99 %, median 4.0, known of 95%), "
         "mean confidence 0.50, sky 5%)"
     )
-    alone = DepthEstimate(depth_m=None, disparity_px=px)
+    alone = DepthEstimate(input=seen, depth_m=None, disparity_px=px)
     assert repr(alone) == "DepthEstimate(30x20, disparity 8.0 .. 8.0 px (1 to 99 %, median 8.0))"
-    empty = DepthEstimate(depth_m=depth_m * torch.nan, disparity_px=px)
+    empty = DepthEstimate(input=seen, depth_m=depth_m * torch.nan, disparity_px=px)
     assert repr(empty) == "DepthEstimate(30x20, depth nowhere known)"
 
 

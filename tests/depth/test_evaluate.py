@@ -15,10 +15,11 @@ from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.core.run_folder import note_result
 from depthpose.core.runner import Job
 from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
-from depthpose.depth.disparity import depth_from_disparity, find_unit_mistake, resize_map
+from depthpose.depth.disparity import depth_from_disparity, resize_map
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import FrameMetrics, evaluate, measure_frame, read_frame_result
 from depthpose.depth.predictions import (
+    OutputOptions,
     estimate_missing_depth,
     is_finished,
     read_disparity,
@@ -28,6 +29,7 @@ from depthpose.depth.predictions import (
 from depthpose.depth.protocols import clamped_depth_from_disparity
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.unit_mistakes import find_unit_mistake
 
 W, H = 64, 32
 
@@ -68,9 +70,10 @@ def test_the_sky_of_a_prediction_is_shown_as_sky(pairs: Dataset, tmp_path: Path)
     is_sky[:5] = True
     disparity_px = torch.where(is_sky, 0.004, truth_px(0))
     depth_m = torch.where(is_sky, torch.nan, depth_from_disparity(truth_px(0), rig()))
-    estimate = DepthEstimate(depth_m=depth_m, disparity_px=disparity_px, is_sky=is_sky)
-    write_estimate(tmp_path / "p", pairs.read_input(0), estimate)
-    again = read_estimate(tmp_path / "p", "a", rig())
+    seen = pairs.read_input(0)
+    estimate = DepthEstimate(input=seen, depth_m=depth_m, disparity_px=disparity_px, is_sky=is_sky)
+    write_estimate(tmp_path / "p", estimate)
+    again = read_estimate(tmp_path / "p", pairs.read_input(0))
     assert again.is_sky is not None
     assert torch.equal(again.is_sky, is_sky)
     shown = read_frame_result(pairs, 0, tmp_path / "p", "kitti-2015", None)[0].depth_m
@@ -85,13 +88,14 @@ def test_a_prediction_of_another_size_is_shown_at_that_of_the_truth(
     is_sky = torch.zeros(H // 2, W // 2, dtype=torch.bool)
     is_sky[:5] = True
     estimate = DepthEstimate(
+        input=pairs.read_input(0),
         depth_m=None,
         disparity_px=truth_px(0)[::2, ::2] / 2,
         confidence=torch.ones(H // 2, W // 2),
         right=torch.rand(3, H // 2, W // 2),
         is_sky=is_sky,
     )
-    write_estimate(tmp_path / "p", pairs.read_input(0), estimate)
+    write_estimate(tmp_path / "p", estimate)
     without_right = replace(pairs.frames[0], right=None)  # a right image must have the drawn size
     single = replace(pairs, frames=[without_right])
     shown, error = read_frame_result(single, 0, tmp_path / "p", "kitti-2015", None)
@@ -446,14 +450,16 @@ def test_predicting_goes_on_where_it_stopped(pairs: Dataset, tmp_path: Path) -> 
 
 def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:
     pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
-    estimate = DepthEstimate(depth_m=None, disparity_px=truth_px(0), right=torch.rand(3, H, W))
-    files = write_estimate(tmp_path, pair, estimate)
+    estimate = DepthEstimate(
+        input=pair, depth_m=None, disparity_px=truth_px(0), right=torch.rand(3, H, W)
+    )
+    files = write_estimate(tmp_path, estimate)
     written = sorted(path.name for path in tmp_path.iterdir())
     assert written == ["x.color.png", "x.disparity_px.npy", "x.right.png"]
     note_result(tmp_path, "x", files)
     assert is_finished(tmp_path, "x")
     with pytest.raises(InputError, match="a cloud needs metres"):
-        write_estimate(tmp_path, pair, estimate, cloud_m=80.0)
+        write_estimate(tmp_path, estimate, OutputOptions(cloud_m=80.0))
 
 
 def test_an_estimate_is_read_back(tmp_path: Path) -> None:
@@ -461,10 +467,14 @@ def test_an_estimate_is_read_back(tmp_path: Path) -> None:
     depth_m = depth_from_disparity(truth_px(0), rig())
     right = torch.ones(3, H, W) / 255
     estimate = DepthEstimate(
-        depth_m=depth_m, disparity_px=truth_px(0), confidence=torch.rand(H, W), right=right
+        input=pair,
+        depth_m=depth_m,
+        disparity_px=truth_px(0),
+        confidence=torch.rand(H, W),
+        right=right,
     )
-    write_estimate(tmp_path, pair, estimate)
-    again = read_estimate(tmp_path, "x", None)
+    write_estimate(tmp_path, estimate)
+    again = read_estimate(tmp_path, replace(pair, camera=None))
     for one, other in (
         (again.depth_m, depth_m),
         (again.disparity_px, truth_px(0)),
@@ -475,10 +485,10 @@ def test_an_estimate_is_read_back(tmp_path: Path) -> None:
         assert other is not None
         assert torch.allclose(one, other)
     (tmp_path / "x.depth_m.npy").unlink()
-    from_rig = read_estimate(tmp_path, "x", rig()).depth_m
+    from_rig = read_estimate(tmp_path, pair).depth_m
     assert from_rig is not None
     assert torch.allclose(from_rig, depth_m)
-    assert read_estimate(tmp_path, "x", None).depth_m is None
+    assert read_estimate(tmp_path, replace(pair, camera=None)).depth_m is None
 
 
 def test_the_columns_of_a_row_are_its_fields_in_order(pairs: Dataset, tmp_path: Path) -> None:

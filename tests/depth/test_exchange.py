@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from depthpose.core.camera import StereoRig
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.errors import MissingExtraError
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.types import DepthEstimate, Match, StereoInput
+from depthpose.depth.types import Match, StereoInput
 
 H, W, F = 4, 6, 8.0
 DEPTH_M = torch.arange(1, H * W + 1, dtype=torch.float32).reshape(H, W) * 4
@@ -40,11 +40,6 @@ def test_an_estimate_holds_its_coloured_cloud_up_to_a_distance() -> None:
     assert torch.equal(cloud.color, seen.left.permute(1, 2, 0).reshape(-1, 3)[is_near])
     x_m, y_m, z_m = cloud.points[0].tolist()
     assert (x_m, y_m, z_m) == pytest.approx((-2.5 / F * 4, -1.5 / F * 4, 4.0))
-
-
-def test_an_estimate_from_files_says_that_it_has_no_colours() -> None:
-    with pytest.raises(InputError, match="came without its image; estimate again, or set input="):
-        DepthEstimate(depth_m=DEPTH_M, disparity_px=DEPTH_M).to_open3d()
 
 
 def test_without_open3d_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

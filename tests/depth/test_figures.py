@@ -17,6 +17,7 @@ def pair(with_right: bool = True) -> StereoInput:
 
 def estimate(depth_m: float | None = 10.0, with_right: bool = True) -> DepthEstimate:
     return DepthEstimate(
+        input=pair(with_right=not with_right),
         depth_m=None if depth_m is None else torch.full((H, W), depth_m),
         disparity_px=torch.ones(H, W),
         right=torch.rand(3, H, W) if with_right else None,

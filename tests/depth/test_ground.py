@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.camera import Camera
+from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError
+from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.ground import fit_ground
 from depthpose.depth.mount import MountFilter, scale_by_distance, scale_by_mount
 from depthpose.depth.predictions import write_estimate
@@ -41,13 +42,20 @@ def estimate(depth_m: Float[Tensor, "h w"]) -> DepthEstimate:
     is_sky[:20] = True
     known = torch.where(is_sky, torch.nan, depth_m)
     px = torch.where(is_sky, 0.01, 100 / depth_m)
-    return DepthEstimate(depth_m=known, disparity_px=px, is_sky=is_sky)
+    return DepthEstimate(input=seen(), depth_m=known, disparity_px=px, is_sky=is_sky)
 
 
 def seen(**mount: float) -> StereoInput:
     """Make an input of the camera with what is known of its mount."""
     camera = replace(CAMERA, **mount)
     return StereoInput(name="street", left=torch.zeros(3, 200, 400), right=None, camera=camera)
+
+
+def correct(
+    given: DepthEstimate, image: StereoInput, mount: MountFilter | None = None
+) -> DepthEstimate:
+    """Correct an estimate as one of this image."""
+    return scale_by_mount(replace(given, input=image), mount)
 
 
 def test_ground_that_is_not_quite_flat_is_ground_and_what_stands_on_it_is_less_sure() -> None:
@@ -58,7 +66,7 @@ def test_ground_that_is_not_quite_flat_is_ground_and_what_stands_on_it_is_less_s
     plane = (slice(150, 160), slice(100, 140))
     depth_m[bump] *= 1.07
     depth_m[box] *= 0.7
-    found = scale_by_mount(estimate(depth_m), seen(mount_height_m=2.0, tilt_deg=0.0))
+    found = correct(estimate(depth_m), seen(mount_height_m=2.0, tilt_deg=0.0))
     assert found.depth_m is not None
     factor = found.depth_m / depth_m
     assert float(factor[plane].mean()) > 1.2
@@ -70,7 +78,7 @@ def test_where_the_map_is_tilted_up_too_far_the_camera_stands_higher_than_in_it(
     """A map has the height of its training near by and the true one far off."""
     heights_m: list[float] = []
     for tilt_deg in (-2.0, 0.0, 2.0):
-        found = scale_by_mount(estimate(road(1.5, tilt_deg, 0)), seen(tilt_deg=0.0))
+        found = correct(estimate(road(1.5, tilt_deg, 0)), seen(tilt_deg=0.0))
         assert found.ground is not None
         heights_m.append(found.ground.height_m)
     assert heights_m == sorted(heights_m)
@@ -78,11 +86,11 @@ def test_where_the_map_is_tilted_up_too_far_the_camera_stands_higher_than_in_it(
 
 
 def test_a_measured_distance_scales_the_height_and_its_deviation_alike() -> None:
-    judged = scale_by_mount(estimate(road(1.5, 0, 0)), seen())
+    judged = correct(estimate(road(1.5, 0, 0)), seen())
     assert judged.ground is not None
     assert judged.depth_m is not None
     twice_m = 2 * float(judged.depth_m[190, 200])
-    found = scale_by_distance(judged, "street", (200, 190, twice_m)).ground
+    found = scale_by_distance(judged, (200, 190, twice_m)).ground
     assert found is not None
     assert found.height_m == pytest.approx(2 * judged.ground.height_m, rel=0.02)
     share = judged.ground.height_std_m / judged.ground.height_m
@@ -163,12 +171,12 @@ def test_a_road_of_few_points_in_every_strip_is_no_ground() -> None:
 def test_what_is_no_road_is_none(depth_m: Float[Tensor, "200 400"]) -> None:
     assert fit_ground(depth_m, CAMERA) is None
     with pytest.raises(InputError, match=r"no road is seen .* give --known-distance"):
-        scale_by_mount(estimate(depth_m), seen(mount_height_m=1.5))
+        correct(estimate(depth_m), seen(mount_height_m=1.5))
 
 
 def test_a_known_mount_gives_the_near_road_its_depth_and_leaves_the_sky() -> None:
     given = estimate(road(1.6, -3, 0))
-    found = scale_by_mount(given, seen(mount_height_m=2.4, tilt_deg=-3.0))
+    found = correct(given, seen(mount_height_m=2.4, tilt_deg=-3.0))
     assert found.ground is not None
     assert (found.ground.height_m, found.ground.tilt_deg) == (2.4, -3.0)
     truth = road(2.4, -3, 0)
@@ -185,7 +193,7 @@ def test_a_known_mount_gives_the_near_road_its_depth_and_leaves_the_sky() -> Non
 def test_ground_and_sizes_are_joined_by_inverse_variances_in_the_logarithm_of_depth() -> None:
     """A pixel of the road, worked out by hand: 0.12 by size, 0.03 of the height, 0.2 degrees."""
     given = estimate(road(1.6, -3, 0))
-    found = scale_by_mount(given, seen(mount_height_m=2.4, tilt_deg=-1.0))
+    found = correct(given, seen(mount_height_m=2.4, tilt_deg=-1.0))
     assert found.depth_m is not None and given.depth_m is not None  # noqa: PT018
     for row in (120, 150, 190):
         by_size_m = float(given.depth_m[row, 200])
@@ -201,7 +209,7 @@ def test_what_stands_on_the_road_is_moved_half_of_the_way_as_its_size_says_the_o
     depth_m = road(1.6, -3, 0)
     wall = (slice(100, 150), slice(150, 250))
     depth_m[wall] = 3.0
-    found = scale_by_mount(estimate(depth_m), seen(mount_height_m=2.4, tilt_deg=-3.0))
+    found = correct(estimate(depth_m), seen(mount_height_m=2.4, tilt_deg=-3.0))
     assert found.depth_m is not None
     standing = torch.full((50, 100), 3.0 * math.sqrt(1.5))
     torch.testing.assert_close(found.depth_m[wall], standing, rtol=0.02, atol=0)
@@ -211,7 +219,7 @@ def test_a_tilt_alone_is_taken_and_a_wrong_map_gets_a_better_shape() -> None:
     """The median-scaled error knows no scale: what falls is that of the shape."""
     truth = road(1.6, -1, 0)
     wrong = estimate(road(1.6, -3, 0))
-    found = scale_by_mount(wrong, seen(tilt_deg=-1.0))
+    found = correct(wrong, seen(tilt_deg=-1.0))
     assert found.ground is not None
     assert found.ground.tilt_deg == -1.0
     errors: list[float] = []
@@ -223,7 +231,7 @@ def test_a_tilt_alone_is_taken_and_a_wrong_map_gets_a_better_shape() -> None:
 
 
 def test_without_anything_given_or_seen_the_map_counts_less_what_maps_are_off() -> None:
-    found = scale_by_mount(estimate(road(1.6, -3, 1)), seen())
+    found = correct(estimate(road(1.6, -3, 1)), seen())
     assert found.ground is not None
     assert found.ground.tilt_deg == pytest.approx(-2.6, abs=0.1)
     assert found.ground.roll_deg == pytest.approx(1, abs=0.1)
@@ -240,7 +248,7 @@ def test_frames_of_one_mount_hold_the_height_and_smooth_the_tilt() -> None:
     held: list[float] = []
     smooth: list[float] = []
     for height_m, tilt_deg in zip(heights, tilts, strict=True):
-        found = scale_by_mount(estimate(road(height_m, tilt_deg, 0)), seen(), mount)
+        found = correct(estimate(road(height_m, tilt_deg, 0)), seen(), mount)
         assert found.ground is not None
         assert mount.last == found.ground
         held.append(found.ground.height_m)
@@ -251,7 +259,7 @@ def test_frames_of_one_mount_hold_the_height_and_smooth_the_tilt() -> None:
     assert np.std(smooth) < 0.8 * np.std(tilts)
     # Where no road is seen the mount stays that of the frames before.
     before = mount.last
-    scale_by_mount(estimate(torch.full((200, 400), 5.0)), seen(), mount)
+    correct(estimate(torch.full((200, 400), 5.0)), seen(), mount)
     assert mount.last == before
 
 
@@ -263,7 +271,7 @@ def test_what_is_as_steep_as_a_bank_is_no_road() -> None:
 def test_a_known_tilt_corrects_a_wrong_one() -> None:
     wrong = estimate(road(1.6, -1.5, 0))
     by_tilt, alone = (
-        scale_by_mount(wrong, seen(**mount)).depth_m
+        correct(wrong, seen(**mount)).depth_m
         for mount in ({"mount_height_m": 1.6, "tilt_deg": -3.0}, {"mount_height_m": 1.6})
     )
     truth = road(1.6, -3, 0)[140:]
@@ -275,16 +283,31 @@ def test_a_known_tilt_corrects_a_wrong_one() -> None:
 @pytest.mark.parametrize("tilt_deg", [30.0, -9.0])
 def test_a_tilt_that_the_road_contradicts_is_refused(tilt_deg: float) -> None:
     with pytest.raises(InputError, match=r"degrees is given, and the road that is seen says 0.0"):
-        scale_by_mount(estimate(road(1.6, 0, 0)), seen(mount_height_m=1.6, tilt_deg=tilt_deg))
+        correct(estimate(road(1.6, 0, 0)), seen(mount_height_m=1.6, tilt_deg=tilt_deg))
 
 
 def test_a_known_distance_sets_the_scale_by_the_median_around_it() -> None:
     depth_m = road(1.6, 0, 0)
     depth_m[150, 200] = 1000.0  # one wrong pixel
-    found = scale_by_distance(estimate(depth_m), "a", (200.0, 150.0, 19.2))
+    found = scale_by_distance(estimate(depth_m), (200.0, 150.0, 19.2))
     assert found.depth_m is not None
     expected = float(road(1.6, 0, 0)[150, 100]) * 19.2 / float(road(1.6, 0, 0)[150, 200])
     assert float(found.depth_m[150, 100]) == pytest.approx(expected, rel=0.01)
+
+
+def test_of_a_rig_whose_principal_points_differ_disparity_and_depth_stay_one_triangulation() -> (
+    None
+):
+    rig = StereoRig(width=400, height=200, K=CAMERA.K, baseline_m=0.2, cx_right_minus_left_px=40)
+    depth_m = torch.full((200, 400), 2.0)
+    image = replace(seen(), camera=rig)
+    given = DepthEstimate(
+        input=image, depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig)
+    )
+    found = scale_by_distance(given, (200.0, 100.0, 4.0))
+    assert found.depth_m is not None
+    torch.testing.assert_close(found.depth_m, 2 * depth_m)
+    torch.testing.assert_close(depth_from_disparity(found.disparity_px, rig), 2 * depth_m)
 
 
 @pytest.mark.parametrize(
@@ -302,7 +325,7 @@ def test_a_known_distance_that_cannot_be_is_refused(
     known: tuple[float, float, float], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        scale_by_distance(estimate(road(1.6, 0, 0)), "a", known)
+        scale_by_distance(estimate(road(1.6, 0, 0)), known)
 
 
 def test_a_file_holds_the_digits_that_are_the_same_in_every_run(tmp_path: Path) -> None:
@@ -312,9 +335,11 @@ def test_a_file_holds_the_digits_that_are_the_same_in_every_run(tmp_path: Path) 
     written: list[bytes] = []
     for changed in (0.0, 1e-13):
         again = replace(ground, **{k: v * (1 + changed) for k, v in vars(ground).items()})
-        found = DepthEstimate(disparity_px=torch.ones(4, 5), depth_m=None, ground=again)
-        pair = StereoInput(name="a", left=torch.zeros(3, 4, 5), right=None, camera=None)
-        write_estimate(tmp_path, pair, found)
+        image = StereoInput(name="a", left=torch.zeros(3, 4, 5), right=None, camera=None)
+        found = DepthEstimate(
+            input=image, disparity_px=torch.ones(4, 5), depth_m=None, ground=again
+        )
+        write_estimate(tmp_path, found)
         written.append((tmp_path / "a.ground.json").read_bytes())
     assert written[0] == written[1]
     row = json.loads(written[0])

@@ -15,7 +15,7 @@ from depthpose.core.draw import draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
-from depthpose.depth.disparity import estimate_from_pair, resize_match
+from depthpose.depth.disparity import resize_match
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import make_export
 from depthpose.depth.labels import LabelConfig, label_pair
@@ -27,6 +27,7 @@ from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.stereo_task import validate_pairs
+from depthpose.depth.triangulation import estimate_from_pair
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
 
@@ -266,11 +267,25 @@ def test_labels_leave_the_sky_out() -> None:
     assert float(known_px[10:, 4:].min()) == 4.0
 
 
+def test_a_lamp_that_is_no_sky_has_no_confidence_of_a_sky() -> None:
+    """A few pixels that surely look like sky keep a disparity that nobody measured."""
+    image = torch.rand(3, 100, 100)
+    is_sky = torch.zeros(100, 100, dtype=torch.bool)
+    is_sky[50, 40:50] = True
+    confidence = torch.where(is_sky, 0.95, 0.1)
+    match = Match(disparity_px=torch.full((100, 100), 8.0), confidence=confidence, is_sky=is_sky)
+    pair = StereoInput(name="a", left=image, right=image, camera=rig(100, 100))
+    found = estimate_from_pair(pair, match)
+    assert found.is_sky is not None
+    assert found.confidence is not None
+    assert not bool(found.is_sky.any())
+    assert float(found.confidence[is_sky].max()) < 0.06
+
+
 def test_the_sky_is_written_beside_the_depth(tmp_path: Path) -> None:
     found = estimated()
-    assert found.input is not None
-    write_estimate(tmp_path, found.input, found)
-    written = read_estimate(tmp_path, found.input.name, None).is_sky
+    write_estimate(tmp_path, found)
+    written = read_estimate(tmp_path, found.input).is_sky
     assert written is not None
     assert found.is_sky is not None
     assert torch.equal(written, found.is_sky)

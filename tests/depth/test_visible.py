@@ -8,9 +8,8 @@ from torch import Tensor
 
 from depthpose import FakestereoNet
 from depthpose.core.camera import StereoRig
-from depthpose.depth.config import SelectionConfig
-from depthpose.depth.disparity import estimate_from_pair, estimate_from_virtual
 from depthpose.depth.stereo import CallableMatcher
+from depthpose.depth.triangulation import estimate_from_pair, estimate_from_virtual
 from depthpose.depth.types import Match, StereoInput
 from depthpose.depth.visible import find_blank_borders, measure_texture
 
@@ -154,7 +153,7 @@ def test_plain_sky_of_one_image_may_be_a_wall_and_depth_beside_it_keeps_its_conf
     sky[:50] = True
     match = Match(disparity_px=torch.full((H, W), 8.0), confidence=torch.ones(H, W), is_sky=sky)
     seen = StereoInput(name="x", left=image, right=None, camera=rig())
-    found = estimate_from_virtual(seen, SelectionConfig(), match, image)
+    found = estimate_from_virtual(seen, match, image, 0.5)
     assert found.confidence is not None
     assert float(found.confidence[30:50, 70:110].max()) == 0
     assert float(found.confidence[:10].min()) == 1

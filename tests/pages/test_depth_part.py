@@ -23,14 +23,14 @@ def truth_m() -> torch.Tensor:
 
 def estimate(**more: torch.Tensor) -> DepthEstimate:
     assert SAMPLE.truth.disparity_px is not None
-    found = DepthEstimate(depth_m=truth_m(), disparity_px=SAMPLE.truth.disparity_px)
+    found = DepthEstimate(input=PAIR, depth_m=truth_m(), disparity_px=SAMPLE.truth.disparity_px)
     return replace(found, **more)
 
 
 def test_what_there_is_is_shown_in_its_colours() -> None:
     confidence = torch.rand(truth_m().shape)
     found = estimate(confidence=confidence, right=PAIR.left)
-    section = make_depth_section("a frame", PAIR, found, range_m=(2.0, 40.0))
+    section = make_depth_section("a frame", found, range_m=(2.0, 40.0))
     image, depth, sure, right = drawings(section)
     assert [p.caption.split(",")[0] for p in (image, right)] == ["image", "right view as drawn"]
     assert torch.equal(depth.image, draw_depth(truth_m(), 2.0, 40.0))
@@ -46,7 +46,7 @@ def test_what_there_is_is_shown_in_its_colours() -> None:
 
 
 def test_the_facts_are_those_of_the_map() -> None:
-    facts = dict(make_depth_section("a", PAIR, estimate()).facts)
+    facts = dict(make_depth_section("a", estimate()).facts)
     known_m = truth_m()[truth_m().isfinite()]
     numbers = [float(known_m.double().quantile(share)) for share in (0.01, 0.5, 0.99)]
     assert facts["1, 50, 99 % are nearer than"] == "{:.2f}, {:.2f}, {:.2f} m".format(*numbers)
@@ -60,7 +60,7 @@ def test_the_sky_is_grey_and_said_and_has_no_points() -> None:
     is_sky[:9] = True
     depth_m = torch.where(is_sky, torch.nan, 7.0)
     found = replace(estimate(), depth_m=depth_m, is_sky=is_sky)
-    section = make_depth_section("a", PAIR, found)
+    section = make_depth_section("a", found)
     _, depth = drawings(section)
     assert depth.caption.endswith("grey: sky or no answer")
     assert bool((depth.image[:, :9] == 0.5).all())
@@ -68,14 +68,14 @@ def test_the_sky_is_grey_and_said_and_has_no_points() -> None:
     cloud = section.scenes[0].layers[0].shape
     assert isinstance(cloud, PointCloud)
     assert len(cloud.points) == int((~is_sky).sum())
-    plain = make_depth_section("a", PAIR, estimate())
+    plain = make_depth_section("a", estimate())
     assert drawings(plain)[1].caption.endswith("grey: none")
     assert "sky" not in dict(plain.facts)
 
 
 def test_without_a_camera_there_is_disparity_and_no_cloud() -> None:
-    found = replace(estimate(), depth_m=None)
-    section = make_depth_section("a", replace(PAIR, camera=None), found)
+    found = replace(estimate(), input=replace(PAIR, camera=None), depth_m=None)
+    section = make_depth_section("a", found)
     assert section.pictures[1].color_bar is not None
     assert section.pictures[1].color_bar.title == "disparity [px]"
     assert not section.scenes
@@ -88,7 +88,7 @@ def test_the_error_is_where_the_truth_is(is_sparse: bool) -> None:
     part = (slice(20, 22), slice(30, 32)) if is_sparse else (slice(None), slice(None))
     error[part], known_m[part] = 0.3, 10.0
     wrong = DepthError(error=error, is_disparity=False, true_depth_m=known_m)
-    section = make_depth_section("a", PAIR, estimate(), error=wrong, with_image=False)
+    section = make_depth_section("a", estimate(), error=wrong, with_image=False)
     _, truth, errors = drawings(section)
     bright = draw_share(torch.zeros(1, 1))[:, 0, 0]
     ten = draw_depth(torch.full((1, 1), 10.0))[:, 0, 0]

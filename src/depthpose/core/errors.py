@@ -1,10 +1,10 @@
 """The errors and notices that users see, and functions that word their messages."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeVar
 
 
 class InputError(ValueError):
@@ -13,6 +13,17 @@ class InputError(ValueError):
     The message names the value, the rule that it breaks and the remedy. Readers of files raise no
     other error, whatever bytes they read; commands print it and end with exit code 2.
     """
+
+
+Result = TypeVar("Result")
+
+
+def result_or_error(function: Callable[..., Result], *arguments: object) -> Result | InputError:
+    """Call a function, and return the InputError that it raises: of many, one costs no other."""
+    try:
+        return function(*arguments)
+    except InputError as error:
+        return error
 
 
 class MissingExtraError(ImportError):

@@ -35,12 +35,11 @@ class Results(ABC, Generic[Input, Result]):
         return False
 
     @abstractmethod
-    def store(self, job: Job[Input], data: Input, result: Result) -> None:
+    def store(self, job: Job[Input], result: Result) -> None:
         """Store the result of a job.
 
         Args:
             job: the job.
-            data: the input that it read.
             result: the result.
 
         Raises:
@@ -118,7 +117,7 @@ def _store_outcome(
             raise data
         if isinstance(result, InputError):
             raise result
-        results.store(job, data, result)
+        results.store(job, result)
     except InputError as error:
         results.store_failure(job, error)
         return Outcome(job=job, failure=error)

@@ -92,7 +92,8 @@ class RowDepthBaseline:
         inverse = np.interp(rows, np.arange(_ROWS), 1 / self.depth_m)
         row_depth_m = torch.from_numpy(1 / inverse).float()
         depth_m = row_depth_m[:, None].expand(height, width).contiguous()
-        return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
+        disparity_px = disparity_from_depth(depth_m, rig)
+        return DepthEstimate(input=pair, depth_m=depth_m, disparity_px=disparity_px)
 
 
 def _weigh_depths(
@@ -180,7 +181,8 @@ class NearestImageBaseline:
         focal = float(rig.K[0, 0]) / rig.width
         nearest_focal = float(nearest_rig.K[0, 0]) / nearest_rig.width
         depth_m = focal / nearest_focal / inverse
-        return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
+        disparity_px = disparity_from_depth(depth_m, rig)
+        return DepthEstimate(input=pair, depth_m=depth_m, disparity_px=disparity_px)
 
 
 def fill_by_pyramid(values: Map) -> Map:

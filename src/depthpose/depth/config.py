@@ -345,6 +345,10 @@ class GeneratorConfig(Settings):
     answer: ClassVar[Answer] = "matched"
     """Where depth comes from: this network has no disparity of its own."""
 
+    depth_std: ClassVar[float] = 0.12
+    road_tilt_off_deg: ClassVar[float] = -0.4
+    """As in :class:`SelectionConfig`; of this network they were not measured."""
+
     @property
     def side_multiple_px(self) -> int:
         """Both sides of an image are multiples of this [px]."""

@@ -1,7 +1,6 @@
-"""Disparity to depth and back, matches to estimates, warping, resizing, mistaken units."""
+"""Disparity to depth and back, and maps and matches that are warped or resized."""
 
-import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import fields
 
 import torch
@@ -10,108 +9,17 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, StereoRig
-from depthpose.core.errors import InputError, Notice
-from depthpose.depth.config import GeneratorConfig, SelectionConfig
-from depthpose.depth.types import DepthEstimate, Map, Mask, Match, StereoInput
-from depthpose.depth.visible import find_blank_borders, measure_texture
+from depthpose.core.errors import InputError
+from depthpose.depth.types import Map, Match
 
-_UNIT_MISTAKES = {
-    1000.0: "is its depth in millimetres (divide by 1000), or its disparity in shares of the width "
-    "(multiply by it)?",
-    256.0: "is its depth metres x 256, as KITTI's PNG holds it (divide by 256)?",
-    1 / 256: "is its disparity pixels x 256, as KITTI's PNG holds it (divide by 256)?",
-}
-"""Certain mistakes, by the ratio of predicted to true depth that they cause."""
-_POSSIBLE_MISTAKES = {
-    1000 / 256: "is it a PNG of millimetres, read as metres x 256?",
-    256 / 1000: "is its truth a PNG of millimetres, read as metres x 256?",
-    1 / 16: "is its disparity pixels x 16, as OpenCV's matchers give it?",
-    1 / 5.4: "is it of monodepth2, trained with a baseline of 0.1 m (multiply its depth by 5.4)?",
-}
-"""Possible mistakes, by ratios that a poor estimate may have too."""
-_MISTAKE_TOLERANCE = 1.4
-"""A ratio within this factor of one of ``_UNIT_MISTAKES`` is that mistake: no estimate, however
-poor, is wrong by 250 or 1000 in the median."""
-_POSSIBLE_TOLERANCE = 1.1
-"""A ratio within this factor of one of ``_POSSIBLE_MISTAKES`` may be that mistake."""
-_POOR_RATIO = 3.0
-"""Ratio of median depths from which a notice is given: that of a good estimate is near 1."""
-_NEGATIVE_SHARE = 0.9
-"""Share of the pixels with a negative disparity from which the sign is wrong."""
-_OPPOSITE_CORRELATION = -0.8
-"""Correlation of the logarithms of prediction and truth, below which one is inverted."""
-_given_notices: set[str] = set()
-"""Questions that were asked in a notice already."""
 MIN_DISPARITY_PX = 0.01
 """Least disparity of a match, so that depth stays finite; also the disparity of the sky in a pair
 without a rig."""
 SKY_M = 10_000.0
 """Depth that the disparity of the sky stands for: protocols take a disparity of zero for no
 prediction, or for a near point."""
-_MIN_SKY_SHARE = 0.002
-"""Least share of the image that is sky; fewer pixels are a lamp or a window, and keep the depth of
-the match: 43 of them in a garage made an RMSE of 0.87 m, in place of 0.25 m."""
 MAX_ENLARGED_PIXELS = 8_000_000
 """Most pixels of an image that is enlarged to reach the focal length of a network."""
-
-
-def find_unit_mistake(predicted_px: Map, true_px: Map) -> str | None:
-    """Find the mistake of unit or sign in a predicted disparity, by its truth.
-
-    Returns:
-        The mistake and its remedy, as a sentence for an error; None where there is none, or only
-        one that a poor estimate could look like too. Of such a one a notice is given, once.
-    """
-    is_compared = torch.isfinite(predicted_px) & torch.isfinite(true_px)
-    if not bool(is_compared.any()):
-        return None
-    predicted_px = predicted_px[is_compared]
-    true_px = true_px[is_compared]
-
-    # Certain mistakes: nearly all signs, or a ratio that no estimate has.
-    negative_share = float((predicted_px < 0).float().mean())
-    if negative_share > _NEGATIVE_SHARE:
-        return (
-            f"{negative_share:.0%} of the disparities are negative: left and right were exchanged, "
-            "or the sign is the other one; a left pixel at u is seen at u - disparity on the right"
-        )
-    median_px = float(predicted_px.median())
-    depth_ratio = float(true_px.median()) / median_px if median_px > 0 else 0.0
-    mistake = _find_mistake(depth_ratio, _UNIT_MISTAKES, _MISTAKE_TOLERANCE)
-    if mistake is not None:
-        return f"it lies {depth_ratio:.4g} times as far as the truth: {mistake}"
-
-    # Possible mistakes: a wrong scale, or inverse depth.
-    if depth_ratio > 0 and not 1 / _POOR_RATIO < depth_ratio < _POOR_RATIO:
-        question = _find_mistake(depth_ratio, _POSSIBLE_MISTAKES, _POSSIBLE_TOLERANCE)
-        if question is None:
-            question = "is it without a scale, or of another focal length or baseline?"
-        times = f"{depth_ratio:.3g} times as far as the truth in the median"
-        _give_notice_once(f"lies {times}:", question)
-    logarithms = torch.stack([predicted_px, true_px]).double().clamp_min(1e-3).log()
-    if len(true_px) > 1 and float(logarithms.corrcoef()[0, 1]) < _OPPOSITE_CORRELATION:
-        _give_notice_once("is the nearer the farther its truth is:", "is it inverse depth?")
-    return None
-
-
-def _find_mistake(
-    depth_ratio: float, mistakes: Mapping[float, str], tolerance: float
-) -> str | None:
-    """Find the first of ``mistakes`` whose ratio is ``depth_ratio``, within a factor; or None."""
-    for ratio, question in mistakes.items():
-        if ratio / tolerance < depth_ratio < ratio * tolerance:
-            return question
-    return None
-
-
-def _give_notice_once(statement: str, question: str) -> None:
-    """Give a notice about a prediction, once for all frames of a dataset.
-
-    ``statement`` goes on from "a prediction"; ``question`` asks for a mistake.
-    """
-    if question not in _given_notices:
-        _given_notices.add(question)
-        warnings.warn(f"a prediction {statement} {question}", Notice, stacklevel=3)
 
 
 def depth_from_disparity(
@@ -280,122 +188,3 @@ def resize_map(
     if values.shape == (height, width):
         return values
     return F.interpolate(values[None, None], (height, width), mode="bilinear")[0, 0]
-
-
-def estimate_from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:
-    """Make the estimate of a rectified pair from its match; metres where the camera has a baseline.
-
-    Where the left image is blank (``find_blank_borders`` of ``depth/visible.py``), disparity and
-    depth are NaN. The confidence is 0 where either view is blank, and falls to 0 where the left
-    view has no texture, for nothing can be matched there.
-
-    Args:
-        pair: the images, and their rig where it is known.
-        match: the match, at the size of the images.
-        warning: why the estimate is doubtful; else empty.
-    """
-    disparity_px = match.disparity_px
-    rig = pair.camera if isinstance(pair.camera, StereoRig) else None
-    left_is_blank = find_blank_borders(pair.left).to(disparity_px.device)
-
-    confidence = match.confidence
-    if confidence is not None and pair.right is not None:
-        # Blankness of the right view at the pixel that each left pixel is matched with.
-        right_blank = find_blank_borders(pair.right).to(disparity_px)
-        matched_blank = warp_right_to_left(right_blank[None], disparity_px)[0]
-        right_is_blank = matched_blank.nan_to_num(0.0) > 0.5
-        confidence = confidence * measure_texture(pair.left).to(confidence)
-        confidence = torch.where(left_is_blank | right_is_blank, 0.0, confidence)
-
-    # The sky has the disparity of a point SKY_M away.
-    is_sky = None
-    if match.is_sky is not None:
-        is_sky = _discard_small_sky(match.is_sky & ~left_is_blank)
-        sky_px = MIN_DISPARITY_PX
-        if rig is not None:
-            sky_px = float(rig.K[0, 0]) * rig.baseline_m / SKY_M - rig.cx_right_minus_left_px
-        disparity_px = torch.where(is_sky, sky_px, disparity_px)
-
-    disparity_px = torch.where(left_is_blank, torch.nan, disparity_px)
-    depth_m = None
-    if rig is not None:
-        depth_m = depth_from_disparity(disparity_px, rig)
-        if is_sky is not None:
-            depth_m = torch.where(is_sky, torch.nan, depth_m)
-    return DepthEstimate(
-        depth_m=depth_m,
-        disparity_px=disparity_px,
-        confidence=confidence,
-        is_sky=is_sky,
-        warning=warning,
-        input=pair,
-    )
-
-
-def _discard_small_sky(is_sky: Mask) -> Mask:
-    """Return the mask of the sky; empty where it is so small that it is a lamp or a window."""
-    return is_sky & (is_sky.float().mean() >= _MIN_SKY_SHARE)
-
-
-def estimate_from_virtual(
-    image: StereoInput,
-    generator_config: GeneratorConfig | SelectionConfig,
-    match: Match,
-    right: Float[Tensor, "3 _ _"],
-) -> DepthEstimate:
-    """Make the estimate of one image from its match with a synthesised right view.
-
-    Depth is computed by the virtual baseline, at which the view was synthesised. The confidence of
-    the sky is 0 on plain areas, because a bright wall looks the same.
-
-    Args:
-        image: the image and its camera.
-        generator_config: holds the baseline of the virtual rig.
-        match: the match, at the size of the synthesised view.
-        right: the synthesised view.
-
-    Returns:
-        The estimate, at the size of the image. Disparity and depth are NaN where the image is
-        blank, and depth is NaN in the sky too. Disparity is that of the camera's own baseline where
-        it has one, else that of the virtual one.
-    """
-    camera = image.camera
-    assert camera is not None
-    height, width = image.left.shape[1:]
-    match = resize_match(match, height, width)
-    disparity_px = match.disparity_px
-    confidence = match.confidence
-    # depth = f B / disparity, with the image's own focal length f and the virtual baseline B.
-    focal_m_px = float(camera.K[0, 0]) * generator_config.virtual_baseline_m
-    depth_m = torch.where(disparity_px > 0, focal_m_px / disparity_px, torch.nan)
-
-    # The sky has the disparity of a point SKY_M away.
-    is_blank = find_blank_borders(image.left).to(disparity_px.device)
-    is_sky = None
-    if match.is_sky is not None:
-        is_sky = _discard_small_sky(match.is_sky & ~is_blank)
-        if confidence is not None:
-            sky_confidence = confidence * measure_texture(image.left).to(confidence)
-            confidence = torch.where(is_sky, sky_confidence, confidence)
-        depth_m = torch.where(is_sky, SKY_M, depth_m)
-        disparity_px = torch.where(is_sky, focal_m_px / SKY_M, disparity_px)
-
-    # Blank borders have no depth.
-    depth_m = torch.where(is_blank, torch.nan, depth_m)
-    disparity_px = torch.where(is_blank, torch.nan, disparity_px)
-    if confidence is not None:
-        confidence = torch.where(is_blank, 0.0, confidence)
-
-    # Disparity is that of the camera's own baseline, where it has one.
-    if isinstance(camera, StereoRig):
-        disparity_px = disparity_from_depth(depth_m, camera)
-    if is_sky is not None:
-        depth_m = torch.where(is_sky, torch.nan, depth_m)
-    return DepthEstimate(
-        depth_m=depth_m,
-        disparity_px=disparity_px,
-        confidence=confidence,
-        right=resize_image(right, height, width),
-        is_sky=is_sky,
-        input=image,
-    )

@@ -369,6 +369,7 @@ def read_frame_result(
         true_m = truth
 
     estimate = DepthEstimate(
+        input=dataset.read_input(index),
         depth_m=depth_m,
         disparity_px=prepared.disparity_px,
         confidence=prepared.confidence,

@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.camera import Camera
+from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError
-from depthpose.depth.config import SelectionConfig
+from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.ground import fit_ground
 from depthpose.depth.horizon import Angles, find_angles
 from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
@@ -55,7 +55,6 @@ with twice as much it stands on the ground, and in between it counts partly as e
 _MAX_GROUND_DEPTH_M = 400.0
 """Largest depth of the ground: above its horizon it has none."""
 _DEFAULT_NETWORK = SelectionConfig()
-"""Config of networks that do not say by how much their roads are tilted too far."""
 _DECIMALS = 6
 """Decimals of the values of a mount: as files hold them, so that a rerun continues from the same
 values."""
@@ -78,7 +77,7 @@ def find_mount(
     map_ground: Ground,
     image: StereoInput,
     before: Ground | None = None,
-    network: SelectionConfig = _DEFAULT_NETWORK,
+    network: GeneratorConfig | SelectionConfig = _DEFAULT_NETWORK,
 ) -> Ground:
     """Estimate the camera's height, tilt and roll above a road, with their standard deviations.
 
@@ -195,9 +194,8 @@ def _fuse(first: _Normal, second: _Normal) -> _Normal:
 
 def scale_by_mount(
     estimate: DepthEstimate,
-    image: StereoInput,
     mount: MountFilter | None = None,
-    network: SelectionConfig = _DEFAULT_NETWORK,
+    network: GeneratorConfig | SelectionConfig = _DEFAULT_NETWORK,
 ) -> DepthEstimate:
     """Correct the depth of each pixel by the camera's mount above the road.
 
@@ -207,8 +205,8 @@ def scale_by_mount(
     exactly, and is larger for objects than for the road itself.
 
     Args:
-        estimate: depth by the network.
-        image: the image that was estimated. Height and tilt that its camera states are used.
+        estimate: depth by the network. Height and tilt that the camera of its image states are
+            used.
         mount: the mount by the frames before; it is updated by this frame.
         network: config of the network, with the standard deviation of its depth.
 
@@ -219,6 +217,7 @@ def scale_by_mount(
         InputError: the camera states a height or tilt, and the map shows no road, or one of quite
             another tilt.
     """
+    image = estimate.input
     camera = image.camera
     assert camera is not None
     assert estimate.depth_m is not None
@@ -260,7 +259,11 @@ def _refuse_contradiction(camera: Camera, map_ground: Ground | None, name: str) 
 
 
 def _compute_depth_factor(
-    depth_m: Map, camera: Camera, map_ground: Ground, ground: Ground, network: SelectionConfig
+    depth_m: Map,
+    camera: Camera,
+    map_ground: Ground,
+    ground: Ground,
+    network: GeneratorConfig | SelectionConfig,
 ) -> Map:
     """Compute the factor by which the mount corrects the depth of each pixel.
 
@@ -321,10 +324,11 @@ def _compute_plane(ground: Ground) -> Float[Tensor, "3"]:
 
 
 def rescale(estimate: DepthEstimate, factor: float | Map) -> DepthEstimate:
-    """Multiply the depth of an estimate by a factor, or each pixel by its own; divide disparity.
+    """Multiply the depth of an estimate by a factor, or each pixel by its own.
 
-    The sky keeps its disparity. A single factor multiplies the height of the ground too; a map of
-    factors leaves the ground as it is.
+    The distance of disparity from that of infinity is divided by it; a rig whose principal points
+    differ sees infinity at another disparity than 0. The sky keeps its disparity. A single factor
+    multiplies the height of the ground too; a map of factors leaves the ground as it is.
     """
     assert estimate.depth_m is not None
     ground = estimate.ground
@@ -332,7 +336,9 @@ def rescale(estimate: DepthEstimate, factor: float | Map) -> DepthEstimate:
         ground = replace(
             ground, height_m=ground.height_m * factor, height_std_m=ground.height_std_m * factor
         )
-    disparity_px = estimate.disparity_px / factor
+    camera = estimate.input.camera
+    infinity_px = -camera.cx_right_minus_left_px if isinstance(camera, StereoRig) else 0.0
+    disparity_px = infinity_px + (estimate.disparity_px - infinity_px) / factor
     if estimate.is_sky is not None:
         disparity_px = torch.where(estimate.is_sky, estimate.disparity_px, disparity_px)
     depth_m = estimate.depth_m * factor
@@ -340,13 +346,12 @@ def rescale(estimate: DepthEstimate, factor: float | Map) -> DepthEstimate:
 
 
 def scale_by_distance(
-    estimate: DepthEstimate, name: str, distance: tuple[float, float, float]
+    estimate: DepthEstimate, distance: tuple[float, float, float]
 ) -> DepthEstimate:
     """Scale an estimate so that the depth around one pixel is the measured one.
 
     Args:
         estimate: an estimate with depth.
-        name: name of the image, for errors.
         distance: column, row [px] and camera z [m] of the measured point. Its depth in the estimate
             is the median of the 5 x 5 pixels around it.
 
@@ -357,7 +362,7 @@ def scale_by_distance(
     column, row, distance_m = distance
     assert estimate.depth_m is not None
     height, width = estimate.depth_m.shape
-    context = f"{name}: known distance {column:g},{row:g},{distance_m:g}"
+    context = f"{estimate.input.name}: known distance {column:g},{row:g},{distance_m:g}"
     if not (math.isfinite(distance_m) and distance_m > 0):
         raise InputError(f"{context}: metres must be a positive number")
     if not (-0.5 <= column < width - 0.5 and -0.5 <= row < height - 0.5):

@@ -1,10 +1,10 @@
 """Estimates as files of a folder: writing them, and reading ours or those of other methods."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -20,7 +20,7 @@ from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.depth.config import COLOR_RANGE_M
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
-from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput, View
+from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 
 
 @runtime_checkable
@@ -53,107 +53,76 @@ CLOUD_M = 80.0
 """Distance up to which a cloud is written, unless another is given."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _FileOptions:
-    """Options of the files of an estimate, as :func:`write_estimate` takes them."""
-
-    range_m: tuple[float, float]
-    cloud_m: float | None
-    min_confidence: float | None
-
-
-class _EstimateFile(NamedTuple):
-    """A kind of file ``NAME.ENDING`` of an estimate: how it is written, and what it holds.
-
-    ``content`` gives None where an estimate has nothing of the kind.
-    """
-
-    ending: str
-    write: Callable[[Path, Any], None]
-    content: Callable[[DepthEstimate, _FileOptions], Any]
-
-
-def _make_cloud(estimate: DepthEstimate, options: _FileOptions) -> files.PointCloud | None:
-    """Make the cloud of an estimate; None where none is to be written."""
-    if options.cloud_m is None:
-        return None
-    return estimate.cloud(options.cloud_m, options.min_confidence)
-
-
-def _encode_warning(estimate: DepthEstimate, _: _FileOptions) -> bytes | None:
-    """Encode the warning of an estimate as a line of text; None where it has none."""
-    return f"{estimate.warning}\n".encode() if estimate.warning else None
-
-
-def _round_ground(estimate: DepthEstimate, _: _FileOptions) -> dict[str, float] | None:
-    """Round the values of the road, by name, to digits that every run repeats; None without one."""
-    if estimate.ground is None:
-        return None
-    return {name: round(value, _DECIMALS) for name, value in asdict(estimate.ground).items()}
-
-
-def _draw_sky(estimate: DepthEstimate, _: _FileOptions) -> View | None:
-    """Draw the sky white, and all else black; None where the sky is not recognised."""
-    return None if estimate.is_sky is None else estimate.is_sky.float().expand(3, -1, -1)
-
-
-def _draw_colors(estimate: DepthEstimate, options: _FileOptions) -> View:
-    """Draw the depth of an estimate in colours, or its disparity where it has no depth."""
-    if estimate.depth_m is None:
-        return draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
-    return draw_depth(estimate.depth_m, *options.range_m)
-
-
-_FILES = (
-    _EstimateFile(CLOUD, files.write_cloud, _make_cloud),
-    _EstimateFile("warning.txt", write_bytes, _encode_warning),
-    _EstimateFile("ground.json", files.write_json, _round_ground),
-    _EstimateFile("depth_m.npy", files.write_map, lambda estimate, _: estimate.depth_m),
-    # 16 bits, metres x 256.
-    _EstimateFile("depth.png", files.write_depth_png, lambda estimate, _: estimate.depth_m),
-    _EstimateFile("confidence.npy", files.write_map, lambda estimate, _: estimate.confidence),
-    # The synthesised right view.
-    _EstimateFile("right.png", files.write_image, lambda estimate, _: estimate.right),
-    _EstimateFile("sky.png", files.write_image, _draw_sky),
-    _EstimateFile("color.png", files.write_image, _draw_colors),
-    # In pixels of the frame's own rig.
-    _EstimateFile(LAST, files.write_map, lambda estimate, _: estimate.disparity_px),
+ENDINGS = (
+    CLOUD,
+    "warning.txt",
+    "ground.json",
+    "depth_m.npy",
+    "depth.png",  # 16 bits, metres x 256
+    "confidence.npy",
+    "right.png",  # the synthesised right view
+    "sky.png",
+    "color.png",
+    LAST,  # in pixels of the frame's own rig
 )
-"""The files of an estimate, in the order in which they are written."""
-ENDINGS = tuple(file.ending for file in _FILES)
-"""What follows ``NAME.`` in the names of the files of an estimate."""
+"""What follows ``NAME.`` in the names of the files of an estimate, in the order of writing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputOptions:
+    """What the files of an estimate show."""
+
+    range_m: tuple[float, float] = COLOR_RANGE_M  #: depths of the first and the last colour
+    #: distance up to which a cloud (``DepthEstimate.cloud``) has points; None: no cloud is written
+    cloud_m: float | None = None
+    min_confidence: float | None = None  #: least confidence of the cloud's points
 
 
 def write_estimate(
-    folder: Path,
-    pair: StereoInput,
-    estimate: DepthEstimate,
-    range_m: tuple[float, float] = COLOR_RANGE_M,
-    cloud_m: float | None = None,
-    min_confidence: float | None = None,
+    folder: Path, estimate: DepthEstimate, options: OutputOptions | None = None
 ) -> list[Path]:
     """Write the files of one estimate, and return their paths; the disparity comes last.
 
-    They are called ``NAME.ENDING``, with the ``ENDINGS`` of what the estimate has.
-
-    Args:
-        folder: folder of the files.
-        pair: the input; its name is ``NAME``.
-        estimate: what was estimated from it.
-        range_m: depths of the first and the last colour.
-        cloud_m: distance up to which a cloud (``DepthEstimate.cloud``) has points; None: no cloud.
-        min_confidence: least confidence of the cloud's points.
+    They are called ``NAME.ENDING``, with the name of its input and the ``ENDINGS`` of what the
+    estimate has.
     """
-    options = _FileOptions(range_m=range_m, cloud_m=cloud_m, min_confidence=min_confidence)
-    estimate = replace(estimate, input=pair)  # which colours the cloud
+    options = options or OutputOptions()
+    depth_m = estimate.depth_m
+    if depth_m is None:
+        color = draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
+    else:
+        color = draw_depth(depth_m, *options.range_m)
     written: list[Path] = []
-    for file in _FILES:
-        content = file.content(estimate, options)
-        if content is not None:
-            path = folder / f"{pair.name}.{file.ending}"
-            file.write(path, content)
-            written.append(path)
+
+    def write(ending: str, writer: Callable[[Path, Any], None], content: object) -> None:
+        path = folder / f"{estimate.input.name}.{ending}"
+        writer(path, content)
+        written.append(path)
+
+    if options.cloud_m is not None:
+        cloud = estimate.cloud(options.cloud_m, options.min_confidence)
+        write(CLOUD, files.write_cloud, cloud)
+    if estimate.warning:
+        write("warning.txt", write_bytes, f"{estimate.warning}\n".encode())
+    if estimate.ground is not None:
+        write("ground.json", files.write_json, _round_ground(estimate.ground))
+    if depth_m is not None:
+        write("depth_m.npy", files.write_map, depth_m)
+        write("depth.png", files.write_depth_png, depth_m)
+    if estimate.confidence is not None:
+        write("confidence.npy", files.write_map, estimate.confidence)
+    if estimate.right is not None:
+        write("right.png", files.write_image, estimate.right)
+    if estimate.is_sky is not None:
+        write("sky.png", files.write_image, estimate.is_sky.float().expand(3, -1, -1))
+    write("color.png", files.write_image, color)
+    write(LAST, files.write_map, estimate.disparity_px)
     return written
+
+
+def _round_ground(ground: Ground) -> dict[str, float]:
+    """Round the values of a road, by name, to digits that every run repeats."""
+    return {name: round(value, _DECIMALS) for name, value in asdict(ground).items()}
 
 
 def is_finished(folder: Path, name: str, *, with_cloud: bool = False) -> bool:
@@ -259,23 +228,25 @@ def read_part(folder: Path, name: str, ending: str) -> Float[Tensor, "*c h w"] |
     return files.read_image(path) if is_png else files.read_map(path)
 
 
-def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstimate:
-    """Read an estimate that :func:`write_estimate` wrote, without its input.
+def read_estimate(folder: Path, depth_input: StereoInput) -> DepthEstimate:
+    """Read the estimate of an input that :func:`write_estimate` wrote.
 
-    ``camera`` of the frame makes depth of the disparity where no depth was written.
+    A rig of the input makes depth of the disparity where no depth was written.
 
     Raises:
-        InputError: there is no prediction of that name, or a file of it is damaged.
+        InputError: there is no prediction of its name, or a file of it is damaged.
     """
+    name = depth_input.name
     disparity_px = read_part(folder, name, LAST)
     if disparity_px is None:
         raise InputError(f"{folder}: no prediction for frame {name!r}; predict it again")
     warning_path = _find_file(folder / name, ("warning.txt",))
     sky = read_part(folder, name, "sky.png")
     depth_m = read_part(folder, name, "depth_m.npy")
-    if depth_m is None and isinstance(camera, StereoRig):
-        depth_m = depth_from_disparity(disparity_px, camera)
+    if depth_m is None and isinstance(depth_input.camera, StereoRig):
+        depth_m = depth_from_disparity(disparity_px, depth_input.camera)
     return DepthEstimate(
+        input=depth_input,
         depth_m=depth_m,
         disparity_px=disparity_px,
         confidence=read_part(folder, name, "confidence.npy"),
@@ -307,19 +278,15 @@ class DepthResults(Results[StereoInput, DepthEstimate]):
     """Results of a run of estimates: files of one folder, as :func:`write_estimate` names them."""
 
     folder: Path  #: claimed before (:func:`depthpose.core.run_folder.claim_folder`)
-    range_m: tuple[float, float] = COLOR_RANGE_M
-    cloud_m: float | None = None  #: None: no cloud is written
-    min_confidence: float | None = None  #: least confidence of a cloud's points
+    options: OutputOptions = OutputOptions()
 
     def is_finished(self, job: Job[StereoInput]) -> bool:
         """Whether an earlier run wrote the whole estimate, with a cloud if there shall be one."""
-        return is_finished(self.folder, job.name, with_cloud=self.cloud_m is not None)
+        return is_finished(self.folder, job.name, with_cloud=self.options.cloud_m is not None)
 
-    def store(self, job: Job[StereoInput], data: StereoInput, result: DepthEstimate) -> None:
+    def store(self, job: Job[StereoInput], result: DepthEstimate) -> None:
         """Write the files of an estimate, and record that it is finished."""
-        written = write_estimate(
-            self.folder, data, result, self.range_m, self.cloud_m, self.min_confidence
-        )
+        written = write_estimate(self.folder, result, self.options)
         note_result(self.folder, job.name, written)
 
 

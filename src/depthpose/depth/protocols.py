@@ -21,6 +21,7 @@ from depthpose.depth import predictions as files
 from depthpose.depth.datasets import Dataset, FramePaths, has_lidar, read_lidar_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M, garg_crop, view_errors
 from depthpose.depth.types import Map
+from depthpose.depth.unit_mistakes import find_unit_mistake
 
 _ASPECT_TOLERANCE = 1.01
 """Ratio of two aspects that are still the same: the sides of a scaled image are rounded to whole
@@ -170,9 +171,7 @@ def prepare_frame(
     # Refuse mistaken units and signs. Where principal points differ, the disparity of far points is
     # negative; the sum with their difference is not.
     cx_difference_px = 0.0 if rig is None else rig.cx_right_minus_left_px
-    mistake = disparity.find_unit_mistake(
-        predicted_px + cx_difference_px, true_px + cx_difference_px
-    )
+    mistake = find_unit_mistake(predicted_px + cx_difference_px, true_px + cx_difference_px)
     if mistake is not None:
         raise InputError(f"{path}: {mistake}")
 

@@ -109,6 +109,7 @@ class Ground:
 class DepthEstimate:
     """Depth of one left image."""
 
+    input: StereoInput  #: what it was estimated from, with its colours and camera
     #: metres along the optical axis; NaN where disparity is invalid, and in the sky. None without a
     #: rig.
     depth_m: Map | None
@@ -127,8 +128,6 @@ class DepthEstimate:
     #: why the whole estimate is doubtful, such as an image out of distribution, or a pair that does
     #: not tell whether it is rectified; else empty
     warning: str = ""
-    #: what it was estimated from, for its colours and camera; None where it was read from files
-    input: StereoInput | None = None
 
     def is_sure(self, min_confidence: float | None = None) -> Mask:
         """Find the pixels that have depth, and a confidence that is high enough.
@@ -142,8 +141,7 @@ class DepthEstimate:
         values = self.disparity_px if self.depth_m is None else self.depth_m
         is_estimated = torch.isfinite(values)
         if min_confidence is None:
-            is_pair = self.input is not None and self.input.right is not None
-            min_confidence = 0.5 if is_pair else 0.0
+            min_confidence = 0.0 if self.input.right is None else 0.5
         if self.confidence is None or min_confidence <= 0:
             return is_estimated
         return is_estimated & (self.confidence >= min_confidence)
@@ -156,10 +154,8 @@ class DepthEstimate:
             min_confidence: points of less confidence are left out, as :meth:`is_sure` says.
 
         Raises:
-            InputError: the estimate has no metres, or no input.
+            InputError: the estimate has no metres.
         """
-        if self.input is None:
-            raise InputError("this estimate came without its image; estimate again, or set input=")
         if self.depth_m is None or self.input.camera is None:
             raise InputError(
                 f"{self.input.name}: a cloud needs metres: give a camera with a baseline."

@@ -386,7 +386,7 @@ class PoseResults(Results[Input, PoseEstimate]):
         """Whether an earlier run estimated or refused this input."""
         return job.name in self._finished
 
-    def store(self, job: Job[Input], data: Input, result: PoseEstimate) -> None:  # noqa: ARG002
+    def store(self, job: Job[Input], result: PoseEstimate) -> None:
         """Keep an estimate with the place of its input and the times of earlier stages."""
         assert isinstance(job, PoseJob)
         assert result.name == job.name, f"{result.name!r} is not {job.name!r}"

@@ -1,7 +1,5 @@
 """The section of a report page that shows an estimate of depth: pictures, facts, a 3D view."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 
@@ -43,7 +41,6 @@ _MAX_TRUE_POINTS = 20_000
 
 def make_depth_section(
     title: str,
-    pair: StereoInput,
     estimate: DepthEstimate,
     text: str = "",
     *,
@@ -55,14 +52,14 @@ def make_depth_section(
 
     Args:
         title: title of the section.
-        pair: the input, of which the right image may be missing.
-        estimate: its depth or, without a camera, its disparity.
+        estimate: depth or, without a camera, disparity.
         text: a paragraph below the title.
         range_m: depth of the brightest and of the darkest colour; the 3D view ends at the latter.
         error: error of each pixel, and the truth; None: the truth is unknown.
         with_image: show the left image too.
     """
     _, far_m = range_m
+    pair = estimate.input
     grey_meaning = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
     pictures = [Drawing(image=pair.left, caption="image")] if with_image else []
     if estimate.depth_m is None:
@@ -93,11 +90,11 @@ def make_depth_section(
 
     scenes: list[Scene] = []
     if estimate.depth_m is not None and pair.camera is not None:
-        scene = make_depth_scene(pair, estimate, far_m, f"{title}: the cloud")
+        scene = make_depth_scene(estimate, far_m, f"{title}: the cloud")
         if error is not None and error.true_depth_m is not None:
             scene = _add_truth(scene, error.true_depth_m, pair.camera, far_m)
         scenes.append(scene)
-    facts = list_depth_facts(pair, estimate)
+    facts = list_depth_facts(estimate)
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
 
 
@@ -150,16 +147,12 @@ def _add_truth(scene: Scene, true_m: Map, camera: Camera, far_m: float) -> Scene
     return Scene(caption=caption, layers=[*scene.layers, layer])
 
 
-def list_depth_facts(
-    pair: StereoInput, estimate: DepthEstimate, focal_note: str = ""
-) -> list[tuple[str, str]]:
+def list_depth_facts(estimate: DepthEstimate, focal_note: str = "") -> list[tuple[str, str]]:
     """List facts about an estimate, each a name and a value, for people.
 
-    Args:
-        pair: the input.
-        estimate: its depth or disparity.
-        focal_note: text behind the focal length, such as where it is from.
+    ``focal_note``: text behind the focal length, such as where it is from.
     """
+    pair = estimate.input
     camera = pair.camera
     depth_m = estimate.depth_m
     height, width = pair.left.shape[1:]
@@ -186,22 +179,19 @@ def list_depth_facts(
     if estimate.confidence is not None:
         facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
         if pair.right is not None:
-            pair_estimate = replace(estimate, input=pair)  # so that the limit is that of a pair
-            sure_count = pair_estimate.is_sure().sum()
-            point_count = pair_estimate.is_sure(0.0).sum().clamp(min=1)  # all that have depth
+            sure_count = estimate.is_sure().sum()
+            point_count = estimate.is_sure(0.0).sum().clamp(min=1)  # all that have depth
             unsure_share = 1 - float(sure_count / point_count)
             facts.append(("unsure, not in the cloud", f"{unsure_share:.1%} of the depth"))
     return facts
 
 
-def make_depth_scene(
-    pair: StereoInput, estimate: DepthEstimate, far_m: float, caption: str = "The cloud"
-) -> Scene:
+def make_depth_scene(estimate: DepthEstimate, far_m: float, caption: str = "The cloud") -> Scene:
     """Make the 3D view of an estimate's points up to ``far_m``, in the colours of the image.
 
     ``caption`` begins the text below it.
     """
-    cloud = replace(estimate, input=pair).cloud(far_m)
+    cloud = estimate.cloud(far_m)
     return Scene(
         caption=f"{caption} up to {far_m:g} m, in the camera's frame",
         layers=[Layer(name="points", shape=cloud)],

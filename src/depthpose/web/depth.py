@@ -13,7 +13,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_exif_focal, read_image, write_image
 from depthpose.depth.config import COLOR_RANGE_M, StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.predictions import write_estimate
+from depthpose.depth.predictions import OutputOptions, write_estimate
 from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthEstimate, StereoInput
@@ -64,20 +64,20 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     # The files for download, and what the page shows.
     folder = form.folder / "results"
     folder.mkdir()
-    write_estimate(folder, pair, estimate, (near_m, far_m), far_m)
+    write_estimate(folder, estimate, OutputOptions(range_m=(near_m, far_m), cloud_m=far_m))
     write_image(folder / f"{pair.name}.input.jpg", pair.left)
-    pictures = _list_pictures(pair, estimate, (near_m, far_m))
+    pictures = _list_pictures(estimate, (near_m, far_m))
     if estimate.confidence is not None:
         write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - estimate.confidence))
     # The warning is in the sentence already.
-    facts = list_depth_facts(pair, estimate, focal_origin)
+    facts = list_depth_facts(estimate, focal_origin)
     facts = [(name, value) for name, value in facts if name != "warning"]
     return Answer(
         is_ok=not estimate.warning,
-        sentence=_describe_depth(pair, estimate),
+        sentence=_describe_depth(estimate),
         facts=[*facts, ("computed in", f"{seconds:.2f} s")],
         pictures=pictures,
-        scene=make_depth_scene(pair, estimate, far_m),
+        scene=make_depth_scene(estimate, far_m),
         terms=net.terms,
         files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
     )
@@ -193,11 +193,9 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
     return pair, origin
 
 
-def _list_pictures(
-    pair: StereoInput, estimate: DepthEstimate, range_m: tuple[float, float]
-) -> list[ShownPicture]:
+def _list_pictures(estimate: DepthEstimate, range_m: tuple[float, float]) -> list[ShownPicture]:
     """List the pictures that the page shows of an estimate."""
-    name = pair.name
+    name = estimate.input.name
     near_m, far_m = range_m
     grey = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
     colours = f"near bright and far dark, {near_m:g} m to {far_m:g} m by the logarithm"
@@ -222,17 +220,18 @@ def _list_pictures(
     return pictures
 
 
-def _describe_depth(pair: StereoInput, estimate: DepthEstimate) -> str:
+def _describe_depth(estimate: DepthEstimate) -> str:
     """Describe in a sentence how much of the image has a depth, and how far half of it is."""
     assert estimate.depth_m is not None
     finite_m = estimate.depth_m[estimate.depth_m.isfinite()]
-    images = "one image" if pair.right is None else "both images"
+    is_pair = estimate.input.right is not None
+    images = "both images" if is_pair else "one image"
     is_sky = estimate.is_sky
     sky_share = 0.0 if is_sky is None else float(is_sky.float().mean())
     warning = f"Careful: {estimate.warning}. " if estimate.warning else ""
     if len(finite_m) == 0:
         ending = f"; {sky_share:.0%} of the image is taken for sky." if is_sky is not None else "."
-        if pair.right is not None and sky_share < _MIN_SKY_SHARE:
+        if is_pair and sky_share < _MIN_SKY_SHARE:
             ending = ": is the pair rectified, and are left and right as they should be?"
         return f"{warning}No pixel got a depth from {images}{ending}"
     share = len(finite_m) / estimate.depth_m.numel()

@@ -298,7 +298,6 @@ def _make_frame_sections(
         value = row.metrics[metric.name]
         section = make_depth_section(
             f"{folder.name}: {row.frame}, {role}",
-            dataset.read_input(index),
             estimate,
             f"The {role} of {frame_count} by {metric.name}: {value:.4f}{cap_text}.",
             error=error,

@@ -92,13 +92,15 @@ class ScaleOptions:
     sets the scale of each image."""
 
     def refuse_unusable(self) -> None:
-        """Refuse heights and tilts that no camera over a road has."""
+        """Refuse heights and tilts that no camera over a road has, and no three numbers."""
         height_m = self.camera_height
         tilt_deg = self.camera_tilt
         if height_m is not None:
             refuse_outside(_MIN_HEIGHT_M, _MAX_HEIGHT_M, "--camera-height", height_m, " metres")
         if tilt_deg is not None:
             refuse_outside(-_MAX_TILT_DEG, _MAX_TILT_DEG, "--camera-tilt", tilt_deg, " degrees")
+        if self.known_distance is not None:
+            self.parse_known_distance()
 
     def parse_known_distance(self) -> tuple[float, float, float]:
         """Parse ``--known-distance``, which must be set.

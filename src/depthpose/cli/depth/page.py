@@ -56,8 +56,8 @@ def write_depth_page(
     if films:
         sections.append(Section(title="Videos", films=films))
     for depth_input in shown_inputs:
-        estimate = read_estimate(out, depth_input.name, depth_input.camera)
-        section = make_depth_section(depth_input.name, depth_input, estimate, range_m=range_m)
+        estimate = read_estimate(out, depth_input)
+        section = make_depth_section(depth_input.name, estimate, range_m=range_m)
         sections.append(section)
     title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
     write_page(out / PAGE, title, sections, describe_environment())

@@ -25,13 +25,20 @@ from depthpose.cli.engine import EngineOptions, print_shards
 from depthpose.core import run_folder
 from depthpose.core.draw import draw_depth
 from depthpose.core.engine import Computation, InputFormat, JobInputs, LocalInput, ResultWriter
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, result_or_error
 from depthpose.core.files import read_map, read_video, write_video
 from depthpose.core.processes import find_rank, wait_for
 from depthpose.core.runner import Job, run_jobs
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.mount import MountFilter, scale_by_distance
-from depthpose.depth.predictions import CLOUD_M, ENDINGS, DepthResults, is_finished, read_ground
+from depthpose.depth.predictions import (
+    CLOUD_M,
+    ENDINGS,
+    DepthResults,
+    OutputOptions,
+    is_finished,
+    read_ground,
+)
 from depthpose.depth.types import DepthEstimate, StereoInput
 
 
@@ -214,9 +221,11 @@ class DepthPredictor:
         """
         results = DepthResults(
             folder=self.out,
-            range_m=self.output.color_range,
-            cloud_m=CLOUD_M if self.output.cloud else None,
-            min_confidence=self.output.min_confidence,
+            options=OutputOptions(
+                range_m=self.output.color_range,
+                cloud_m=CLOUD_M if self.output.cloud else None,
+                min_confidence=self.output.min_confidence,
+            ),
         )
         estimate_many = partial(self._estimate_many, mount=mount)
         outcomes = run_jobs(jobs, estimate_many, results, self.output.batch)
@@ -242,25 +251,16 @@ class DepthPredictor:
         """Estimate inputs together; ``mount``: of the camera, where all are frames of one."""
         net = self.method.estimator
         assert isinstance(net, FakestereoNet), "weights build no other"
-        named_inputs = [(depth_input.name, depth_input) for depth_input in inputs]
-        estimates = net.estimate_batch(named_inputs, mount=mount)
+        estimates = net.estimate_batch(inputs, mount=mount)
         if self.reader.scale.known_distance is None:
             return estimates
+        distance = self.reader.scale.parse_known_distance()
         return [
-            self._scale_by_known_distance(name, estimate)
-            for (name, _), estimate in zip(named_inputs, estimates, strict=True)
+            estimate
+            if isinstance(estimate, InputError)
+            else result_or_error(scale_by_distance, estimate, distance)
+            for estimate in estimates
         ]
-
-    def _scale_by_known_distance(
-        self, name: str, estimate: DepthEstimate | InputError
-    ) -> DepthEstimate | InputError:
-        """Scale an estimate to the depth measured at a pixel; a failed one stays as it is."""
-        if isinstance(estimate, InputError):
-            return estimate
-        try:
-            return scale_by_distance(estimate, name, self.reader.scale.parse_known_distance())
-        except InputError as error:
-            return error
 
     def _note_failure(self, name: str, error: InputError) -> None:
         """Keep why an input has no result, and tell the other processes of a launch."""

@@ -226,7 +226,7 @@ class PoseFiles(Results[Any, PoseEstimate]):
 
     folder: Path
 
-    def store(self, job: Job[Any], data: Any, result: PoseEstimate) -> None:  # noqa: ANN401, ARG002
+    def store(self, job: Job[Any], result: PoseEstimate) -> None:
         """Write an estimate as an entry of ``poses.json`` has it."""
         row = prediction_row(Prediction(estimate=result))
         write_json(self.folder / f"{job.name}.{ENDING}", row)

@@ -76,7 +76,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         """Whether the image has been searched."""
         return job.name in self.by_image
 
-    def store(self, job: Job[ViewInput], data: ViewInput, result: list[PoseEstimate]) -> None:  # noqa: ARG002
+    def store(self, job: Job[ViewInput], result: list[PoseEstimate]) -> None:
         """Write the estimates of an image."""
         self._keep(job, result)
 

@@ -152,7 +152,7 @@ def _make_figure_sections(
     for k, index in enumerate(choose_frames(predicted, frame_count)):
         pair = predicted.read_input(index)
         lidar_m = _read_lidar(frames[index])
-        estimate = read_estimate(predictions, pair.name, pair.camera)
+        estimate = read_estimate(predictions, pair)
         figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
         if k == 0 and estimate.right is not None and pair.right is not None:
             stereo = method.estimator.estimate_input(pair)

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from functools import partial
 from itertools import groupby, islice
-from operator import itemgetter
 from pathlib import Path
 from typing import cast
 
@@ -26,13 +25,13 @@ from depthpose.core.camera import (
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.devices import force_float32, map_in_threads
-from depthpose.core.errors import InputError, Notice
+from depthpose.core.errors import InputError, Notice, result_or_error
 from depthpose.core.files import AnyPicture as AnyPicture
 from depthpose.core.files import read_exif_focal, rgb_from_picture
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator.pair import depth_from_pair
 from depthpose.depth.estimator.single_image import depth_from_images, virtual_sizes
-from depthpose.depth.mount import MountFilter, scale_by_distance
+from depthpose.depth.mount import MountFilter, scale_by_distance, scale_by_mount
 from depthpose.depth.stereo import (
     Matcher,
     SGBMMatcher,
@@ -308,7 +307,7 @@ class FakestereoNet:
         estimate = self.estimate_input(pair, mount=mount)
         if known_distance is None:
             return estimate
-        return scale_by_distance(estimate, name, known_distance)
+        return scale_by_distance(estimate, known_distance)
 
     @force_float32()
     def estimate_input(
@@ -323,7 +322,7 @@ class FakestereoNet:
         Raises:
             InputError: as :meth:`estimate`.
         """
-        return self._estimate_in_groups([depth_input], mount)[0]
+        return self._correct_by_mount(self._estimate_alone(depth_input), mount)
 
     @force_float32()
     def estimate_many(
@@ -369,7 +368,7 @@ class FakestereoNet:
         total = len(sequence) if isinstance(sequence, Sized) else None
 
         estimates: list[DepthEstimate | InputError] = []
-        estimate = partial(self.estimate_batch, lens=lens)
+        estimate = partial(self._estimate_pictures, lens=lens)
         batches = _yield_named_batches(sequence, batch)
         with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
             for estimates_of_batch in map_in_threads(estimate, batches, threads):
@@ -377,69 +376,65 @@ class FakestereoNet:
                 bar.update(len(estimates_of_batch))
         return estimates
 
+    def _estimate_pictures(
+        self, named: Sequence[tuple[str, object]], lens: AnyLens | None
+    ) -> list[DepthEstimate | InputError]:
+        """Read and estimate a batch of :meth:`estimate_many`: names, with pictures or inputs."""
+        inputs = [
+            image
+            if isinstance(image, StereoInput)
+            else result_or_error(as_input, image, name, lens)
+            for name, image in named
+        ]
+        readable = [item for item in inputs if not isinstance(item, InputError)]
+        estimates = iter(self.estimate_batch(readable))
+        return [item if isinstance(item, InputError) else next(estimates) for item in inputs]
+
     @force_float32()
     def estimate_batch(
-        self,
-        named: Sequence[tuple[str, object]],
-        lens: AnyLens | None = None,
-        *,
-        mount: MountFilter | None = None,
+        self, inputs: Sequence[StereoInput], *, mount: MountFilter | None = None
     ) -> list[DepthEstimate | InputError]:
-        """Estimate a batch at once; where that fails, each image by itself, so that others succeed.
+        """Estimate inputs in one call of the networks; where that fails, each by itself.
 
         Args:
-            named: names and inputs, or pictures.
-            lens: camera of the pictures, as for :meth:`estimate_many`.
+            inputs: single images or pairs.
             mount: as for :meth:`estimate`; the images are its frames, in order.
 
         Returns:
             As :meth:`estimate_many`.
         """
-        last_mount = None if mount is None else mount.last
+        estimates: list[DepthEstimate | InputError]
         try:
-            inputs = [
-                image if isinstance(image, StereoInput) else as_input(image, name, lens)
-                for name, image in named
-            ]
-            return [*self._estimate_in_groups(inputs, mount)]
-        except InputError as error:
-            if len(named) == 1:
-                return [error]
+            estimates = [*self._estimate_by_networks(inputs)]
+        except InputError:  # of one of them: the others have an estimate
+            estimates = [result_or_error(self._estimate_alone, item) for item in inputs]
+        correct = partial(self._correct_by_mount, mount=mount)
+        return [
+            estimate if isinstance(estimate, InputError) else result_or_error(correct, estimate)
+            for estimate in estimates
+        ]
 
-        # Once more from the start, so that an error concerns its own image alone.
-        if mount is not None:
-            mount.last = last_mount
-        estimates: list[DepthEstimate | InputError] = []
-        for named_image in named:
-            estimates += self.estimate_batch([named_image], lens, mount=mount)
-        return estimates
+    def _estimate_alone(self, depth_input: StereoInput) -> DepthEstimate:
+        """Estimate one input by the networks."""
+        (estimate,) = self._estimate_by_networks([depth_input])
+        return estimate
 
-    def _estimate_in_groups(
-        self, inputs: Sequence[StereoInput], mount: MountFilter | None
-    ) -> list[DepthEstimate]:
-        """Estimate inputs in order: pairs one by one, single images of one virtual size together.
+    def _estimate_by_networks(self, inputs: Sequence[StereoInput]) -> list[DepthEstimate]:
+        """Estimate inputs in order, without a correction by the mount.
 
         Raises:
             InputError: an input cannot be estimated.
         """
-        sizes_of_inputs = [
-            None if depth_input.right is not None else self.virtual_sizes(depth_input)
-            for depth_input in inputs
-        ]
-        sized = zip(sizes_of_inputs, inputs, strict=True)
         estimates: list[DepthEstimate] = []
-        for sizes, group in groupby(sized, key=itemgetter(0)):
-            group_inputs = [depth_input for _, depth_input in group]
-            if sizes is None:
-                estimates += [self._estimate_pair(pair) for pair in group_inputs]
+        for is_pair, group in groupby(inputs, key=lambda item: item.right is not None):
+            if is_pair:
+                estimates += [self._estimate_pair(pair) for pair in group]
                 continue
-            assert self.synthesiser is not None, "virtual_sizes checked it"
+            images = list(group)
             estimates += depth_from_images(
-                self.synthesiser,
+                self._require_synthesiser(images[0].name),
                 self.matcher,
-                group_inputs,
-                sizes,
-                mount=mount,
+                images,
                 allow_ood=self.allow_ood,
             )
         return estimates
@@ -459,6 +454,32 @@ class FakestereoNet:
             )
         return depth_from_pair(self.matcher, pair, with_check=self.with_check)
 
+    def _require_synthesiser(self, name: str) -> Synthesiser:
+        """Return the synthesiser, which a single image needs.
+
+        Raises:
+            InputError: there is none; ``name`` is that of the image.
+        """
+        if self.synthesiser is None:
+            raise InputError(
+                f"{name}: there is no right image, and these weights match pairs only; give "
+                "right=, or weights with a generator ('depthpose weights list')."
+            )
+        return self.synthesiser
+
+    def _correct_by_mount(
+        self, estimate: DepthEstimate, mount: MountFilter | None
+    ) -> DepthEstimate:
+        """Correct the depth of a single image by the mount of its camera; a pair stays as it is.
+
+        Raises:
+            InputError: the camera states a mount that the image contradicts.
+        """
+        if estimate.input.right is not None:
+            return estimate
+        synthesiser = self._require_synthesiser(estimate.input.name)
+        return scale_by_mount(estimate, mount, synthesiser.config)
+
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
         """Compute the sizes (rows, columns) at which the generator sees one image.
 
@@ -466,12 +487,8 @@ class FakestereoNet:
             InputError: there is no generator, or what
                 ``virtual_sizes`` of ``depth/estimator/single_image.py`` raises.
         """
-        if self.synthesiser is None:
-            raise InputError(
-                f"{image.name}: there is no right image, and these weights match pairs only; give "
-                "right=, or weights with a generator ('depthpose weights list')."
-            )
-        return virtual_sizes(self.synthesiser, image, allow_ood=self.allow_ood)
+        synthesiser = self._require_synthesiser(image.name)
+        return virtual_sizes(synthesiser, image, allow_ood=self.allow_ood)
 
 
 def _yield_named_batches(

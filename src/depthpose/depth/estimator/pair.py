@@ -9,7 +9,6 @@ from depthpose.core.camera import StereoRig, check_image_matches_camera, check_r
 from depthpose.core.devices import refused_memory
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import check_image
-from depthpose.depth.disparity import estimate_from_pair
 from depthpose.depth.stereo import (
     CameraMatcher,
     Matcher,
@@ -21,6 +20,7 @@ from depthpose.depth.stereo import (
     move_match_back,
     move_views,
 )
+from depthpose.depth.triangulation import estimate_from_pair
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 
 

@@ -1,11 +1,12 @@
-"""One image to depth: synthesise its right view, match both, correct depth by the mount.
+"""One image to depth: synthesise its right view, match both, triangulate.
 
 Images are brought to the virtual rig that the generator imitates: its focal length and baseline.
-Those of one size go through the networks together.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import groupby
+from operator import itemgetter
 
 import torch
 
@@ -14,89 +15,78 @@ from depthpose.core.devices import refused_memory
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import check_image
 from depthpose.depth.config import SelectionConfig
-from depthpose.depth.disparity import estimate_from_virtual, resize_image, size_at_focal_length
-from depthpose.depth.mount import MountFilter, scale_by_mount
+from depthpose.depth.disparity import resize_image, resize_match, size_at_focal_length
 from depthpose.depth.stereo import CameraMatcher, Matcher
 from depthpose.depth.synthesis import SynthesisedViews, Synthesiser
+from depthpose.depth.triangulation import estimate_from_virtual
 from depthpose.depth.types import DepthEstimate, Match, StereoInput, Views
 
 
+@torch.no_grad()
 def depth_from_images(
     synthesiser: Synthesiser,
     matcher: Matcher | None,
     images: Sequence[StereoInput],
-    sizes: Sequence[tuple[int, int]],
     *,
-    mount: MountFilter | None = None,
     allow_ood: bool = False,
 ) -> list[DepthEstimate]:
-    """Estimate depth of single images, and correct it by the mount of their camera.
+    """Estimate depth of single images by the networks alone, without a correction by the mount.
 
     Args:
         synthesiser: left view to right view.
         matcher: pair to disparity; None where the synthesiser estimates disparity itself.
-        images: without right views, all of the same virtual sizes.
-        sizes: these sizes, by :func:`virtual_sizes`.
-        mount: filter of the mount of one camera; the images are then its successive frames.
-        allow_ood: as for :func:`depth_before_mount`.
+        images: without right views. Successive ones of one virtual size are estimated together.
+        allow_ood: estimate images unlike what the weights know too, with a ``warning``.
 
     Raises:
-        InputError: an image unlike what the weights know, or too little memory.
+        InputError: what :func:`virtual_sizes` raises, an image unlike what the weights know, or too
+            little memory.
     """
-    estimates = depth_before_mount(synthesiser, matcher, images, sizes, allow_ood=allow_ood)
-    config = synthesiser.config
-    if not isinstance(config, SelectionConfig):
-        config = SelectionConfig()  # a U-Net's does not say how exact its depth is
-    return [
-        scale_by_mount(estimate, image, mount, config)
-        for estimate, image in zip(estimates, images, strict=True)
+    sized_images = [
+        (virtual_sizes(synthesiser, image, allow_ood=allow_ood), image) for image in images
     ]
+    estimates: list[DepthEstimate] = []
+    for sizes, group in groupby(sized_images, key=itemgetter(0)):
+        group_images = [image for _, image in group]
+        with refused_memory(group_images[0].name):
+            estimates += _estimate_one_size(
+                synthesiser, matcher, group_images, sizes, allow_ood=allow_ood
+            )
+    return estimates
 
 
-@torch.no_grad()
-def depth_before_mount(
+def _estimate_one_size(
     synthesiser: Synthesiser,
     matcher: Matcher | None,
     images: Sequence[StereoInput],
     sizes: Sequence[tuple[int, int]],
     *,
-    allow_ood: bool = False,
+    allow_ood: bool,
 ) -> list[DepthEstimate]:
-    """Estimate depth by the networks alone, before the camera's mount corrects it.
+    """Synthesise the right views of images of the same virtual sizes, match, and triangulate."""
+    lefts = [
+        torch.stack([resize_image(image.left.float(), *size) for image in images]) for size in sizes
+    ]
+    views = synthesiser.draw(*lefts)
+    matches = _match_views(synthesiser, matcher, lefts[0], views)
 
-    Args:
-        synthesiser: left view to right view.
-        matcher: pair to disparity; None where the synthesiser estimates disparity itself.
-        images: without right views, all of the same virtual sizes.
-        sizes: these sizes, by :func:`virtual_sizes`.
-        allow_ood: estimate images unlike what the weights know too, with a ``warning``.
-
-    Raises:
-        InputError: an image unlike what the weights know, or too little memory.
-    """
-    with refused_memory(images[0].name):
-        # Resize to the virtual focal length, synthesise the right views, match.
-        lefts = [
-            torch.stack([resize_image(image.left.float(), *size) for image in images])
-            for size in sizes
-        ]
-        views = synthesiser.draw(*lefts)
-        matches = _match_views(synthesiser, matcher, lefts[0], views)
-
-        # Metres.
-        estimates: list[DepthEstimate] = []
-        for index, image in enumerate(images):
-            match = matches[index]
-            if views.is_sky is not None:
-                match = replace(match, is_sky=views.is_sky[index])
-            estimate = estimate_from_virtual(image, synthesiser.config, match, views.right[index])
-            image_confidence = _estimate_image_confidence(views, index)
-            if image_confidence is not None:
-                warning = _check_in_distribution(
-                    synthesiser, image.name, image_confidence, allow_ood
-                )
-                estimate = replace(estimate, image_confidence=image_confidence, warning=warning)
-            estimates.append(estimate)
+    estimates: list[DepthEstimate] = []
+    for index, image in enumerate(images):
+        match = matches[index]
+        if views.is_sky is not None:
+            match = replace(match, is_sky=views.is_sky[index])
+        size = image.left.shape[1:]
+        estimate = estimate_from_virtual(
+            image,
+            resize_match(match, *size),
+            resize_image(views.right[index], *size),
+            synthesiser.config.virtual_baseline_m,
+        )
+        image_confidence = _estimate_image_confidence(views, index)
+        if image_confidence is not None:
+            warning = _check_in_distribution(synthesiser, image.name, image_confidence, allow_ood)
+            estimate = replace(estimate, image_confidence=image_confidence, warning=warning)
+        estimates.append(estimate)
     return estimates
 
 
