@@ -1,6 +1,7 @@
 """Rectified pairs in place of depth images: they are matched, and unsure depth is left out."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from depthpose.cli.depth.options import PredictOutput
 from depthpose.cli.depth.predict import predict_depth_of_files, wait_for_results
 from depthpose.cli.pose.options import PairOptions
 from depthpose.core.camera import StereoRig, read_rig
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, result_or_error
 from depthpose.core.files import image_size, read_map, write_map
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.processes import find_rank
@@ -68,28 +69,38 @@ def match_pairs_for_poses(
         wait_for_results(pairs, out / MATCHED, with_cloud=False)
 
     names = [left.stem for left, _ in pairs]
-    failures: list[InputError] = []
-    for name in names:
-        try:
-            _write_sure_depth(name, rig, pair.min_confidence, out)
-        except InputError as failure:
-            failures.append(failure)
+    if not _write_all_sure_depth(names, rig, pair.min_confidence, out):
+        exit_code = 1
+    if len(names) == 1:  # a single depth image may have a mask of any name
+        return MatchedPairs(out / DEPTH / f"{names[0]}.npy", exit_code)
+    if not any((out / DEPTH / f"{name}.npy").is_file() for name in names):
+        raise InputError(f"{pair.left}: no pair has depth, for the reasons above; correct these")
+    _remove_depth_of_others(names, out)
+    return MatchedPairs(out / DEPTH, exit_code)
+
+
+def _write_all_sure_depth(
+    names: Sequence[str], rig: StereoRig, min_confidence: float, out: Path
+) -> bool:
+    """Write the sure depth of every matched pair; return whether none failed.
+
+    Raises:
+        InputError: every pair failed.
+    """
+    results = [result_or_error(_write_sure_depth, name, rig, min_confidence, out) for name in names]
+    failures = [result for result in results if isinstance(result, InputError)]
     if failures and len(failures) == len(names):
         raise failures[0]
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
-        exit_code = 1
-    if len(names) == 1:  # a single depth image may have a mask of any name
-        return MatchedPairs(out / DEPTH / f"{names[0]}.npy", exit_code)
+    return not failures
 
-    if not any((out / DEPTH / f"{name}.npy").is_file() for name in names):
-        raise InputError(f"{pair.left}: no pair has depth, for the reasons above; correct these")
 
-    # The depth of other pairs, by an earlier run here, is not posed again.
+def _remove_depth_of_others(names: Sequence[str], out: Path) -> None:
+    """Remove the depth of other pairs, by an earlier run here, so that it is not posed again."""
     for path in (out / DEPTH).glob("*.npy"):
         if path.stem not in names:
             path.unlink(missing_ok=True)
-    return MatchedPairs(out / DEPTH, exit_code)
 
 
 def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Path) -> None:

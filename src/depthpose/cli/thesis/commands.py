@@ -105,34 +105,30 @@ def _build_methods(
     # A table with several rows of the thesis has weights for each, else all are of the one row.
     first_row = table.thesis_rows[0]
     row_names = table.thesis_rows if len(table.thesis_rows) > 1 else [first_row] * len(weights)
-    methods: list[tuple[str, DepthMethod]] = []
+    method_of_name: dict[str, tuple[str, DepthMethod]] = {}
     for row_name, file in zip(row_names, weights, strict=True):
         spec = DepthNetworkSpec(weights=file, config=config, with_right=table.with_right)
-        methods.append((row_name, spec.build()))
-    names = [method.name for _, method in methods]
-    repeated = next((name for name in names if names.count(name) > 1), None)
-    if repeated is not None:
-        raise InputError(
-            f"two weights are called {repeated!r}, and so would their predictions be: rename one."
-        )
-    if matcher is not None:
-        methods.append((first_row, SGBMSpec(with_filled_holes=True).build()))
+        method = spec.build()
+        if method.name in method_of_name:
+            raise InputError(
+                f"two weights are called {method.name!r}, and so would their predictions be: "
+                "rename one."
+            )
+        method_of_name[method.name] = (row_name, method)
 
-    # Methods beside them reproduce no row of the thesis.
+    # Methods beside them reproduce no row of the thesis; weights that have a row are not repeated.
     if not table.with_right:
-        files = ("default",) if beside is None else beside
-        sha256_of_name = {method.name: method.settings["weights_sha256"] for _, method in methods}
-        for file in files:
+        for file in ("default",) if beside is None else beside:
             method = DepthNetworkSpec(weights=file, config=config, with_right=False).build()
-            sha256 = method.settings["weights_sha256"]
-            if sha256_of_name.setdefault(method.name, sha256) != sha256:
+            _, same_name = method_of_name.setdefault(method.name, ("", method))
+            if same_name.settings["weights_sha256"] != method.settings["weights_sha256"]:
                 raise InputError(
                     f"--beside {file}: two weights are called {method.name!r}, and so would their "
                     "predictions be: rename one."
                 )
-            if method.name not in names:
-                methods.append(("", method))
-                names.append(method.name)
+    methods = list(method_of_name.values())
+    if matcher is not None:
+        methods.append((first_row, SGBMSpec(with_filled_holes=True).build()))
     return methods
 
 
