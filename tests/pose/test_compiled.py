@@ -67,7 +67,7 @@ def test_nearest_surface_points(surface: Surface) -> None:
     generator = torch.Generator().manual_seed(1)
     asked_m = surface.diameter_m * torch.randn(3, 300, 3, generator=generator).double()
     _, expected = KDTree(surface.points_m.numpy()).query(asked_m.numpy())
-    assert torch.equal(surface.nearest(asked_m), torch.from_numpy(expected))
+    assert torch.equal(surface.nearest(asked_m).sample, torch.from_numpy(expected))
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 100])

@@ -399,6 +399,5 @@ def _mark_near(
 ) -> Bool[Tensor, " n"]:
     """Mark the points within a limit, in diameters, of the surface at one of several poses."""
     local_m = poses.inverse().apply(points_m)
-    nearest_m = surface.points_m[surface.boxes.look_up(local_m)]
-    gap_m = (local_m - nearest_m).norm(dim=-1)
-    return (gap_m < limit * surface.diameter_m).any(0)
+    distance_m = surface.nearest(local_m, is_exact=False).distance_m
+    return (distance_m < limit * surface.diameter_m).any(0)

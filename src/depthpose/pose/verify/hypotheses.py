@@ -12,7 +12,7 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.geometry.surface import NEAR, Surface
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
 from depthpose.pose.mesh import turn_about
 from depthpose.pose.types import Axis, Evidence, ViewInput
@@ -394,6 +394,5 @@ def _measure_unexplained(
 ) -> Float64[Tensor, " b"]:
     """Measure the share of a cloud that is far from each posed surface, by its nearest samples."""
     local_m = poses.inverse().apply(take_evenly(cloud_m, _SHARE_POINTS))
-    nearest_m = surface.points_m[surface.boxes.look_up(local_m)]
-    is_far = (local_m - nearest_m).norm(dim=-1) > NEAR * surface.diameter_m
+    is_far = surface.nearest(local_m, is_exact=False).distance_m > surface.near_m
     return is_far.double().mean(-1)

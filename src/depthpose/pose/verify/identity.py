@@ -103,7 +103,7 @@ def measure_scale(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) 
         array_of(moved_m[0]),
         float(scale),
         array_of(surface.middle_m),
-        NEAR * surface.diameter_m,
+        surface.near_m,
         surface.target,
         True,
         np.full(moved_m.shape[1], -1),
@@ -148,7 +148,7 @@ def _fit_scale(
     """
     # The limit of a distance shrinks over half of the steps, then stays.
     factors = [1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS)]
-    limits_m = NEAR * surface.diameter_m * np.array(factors)
+    limits_m = surface.near_m * np.array(factors)
     moved = array_of(local_m).copy()
     scales = array_of(start_scales).copy()
     _grow(moved, scales, array_of(surface.middle_m), limits_m, surface.target, is_exact)
@@ -267,11 +267,10 @@ def measure_distance(
     """
     if times is not None:
         local_m = (local_m - surface.middle_m) / times[:, None, None] + surface.middle_m
-    index = surface.nearest(local_m) if is_exact else surface.boxes.look_up(local_m)
-    gap_m = (local_m - surface.points_m[index]).norm(dim=-1)
+    distance_m = surface.nearest(local_m, is_exact=is_exact).distance_m
     if times is not None:
-        gap_m = times[..., None] * gap_m
-    return (gap_m / (NEAR * surface.diameter_m)).clamp(max=1).square().mean(-1).sqrt()
+        distance_m = times[..., None] * distance_m
+    return (distance_m / surface.near_m).clamp(max=1).square().mean(-1).sqrt()
 
 
 def measure_mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
@@ -373,7 +372,7 @@ def identify(
         scale=scale,
         mirror_gain=gain,
         size_tolerance=max_size_error + sensor_error,
-        mirror_tolerance=sides_m / (NEAR * surface.diameter_m),
+        mirror_tolerance=sides_m / surface.near_m,
         offset_error=_bound_offset_error(distance_m),
     )
 
