@@ -239,8 +239,7 @@ def _follow(
         )
 
     # Refined, and the points that lie on it then.
-    icp = replace(target.config.icp, starts=1)
-    refined = refine_best(cloud_m, poses, surface, icp).refined
+    refined, _ = refine_best(cloud_m, poses, surface, target.config.icp)
     pose = refined.camera_from_model.double()
     object_m = scene_m[_mark_near(scene_m, pose[None], surface, NEAR) & ~is_support]
     if len(object_m) < _LEAST_POINTS:

@@ -226,11 +226,12 @@ class Surface:
                 ``boxes``: for many poses, or where a distance off by a box is good enough.
         """
         if is_exact:
-            place = find_nearest_points(array_of(local_m).reshape(-1, 3), self.target.tree)
-            index = torch.from_numpy(place).reshape(local_m.shape[:-1])
+            found = find_nearest_points(array_of(local_m).reshape(-1, 3), self.target.tree)
+            sample = torch.from_numpy(found).reshape(local_m.shape[:-1])
         else:
-            index = self.boxes.look_up(local_m)
-        return Nearest(index, (local_m - self.points_m[index]).norm(dim=-1))
+            sample = self.boxes.look_up(local_m)
+        distance_m = (local_m - self.points_m[sample]).norm(dim=-1)
+        return Nearest(sample, distance_m)
 
     @cached_property
     def plane_normals(self) -> Float64[Tensor, "f 3"]:

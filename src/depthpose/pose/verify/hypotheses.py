@@ -13,9 +13,9 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.geometry.surface import Surface
-from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
+from depthpose.pose.icp import refine_exactly, refine_roughly
 from depthpose.pose.mesh import turn_about
-from depthpose.pose.types import Axis, Evidence, ViewInput
+from depthpose.pose.types import Axis, Evidence, PoseFit, ViewInput
 from depthpose.pose.verify.color import measure_color_agreement
 from depthpose.pose.verify.color_copies import align_print, propose_color_copies
 from depthpose.pose.verify.evidence import Observation, compare
@@ -40,7 +40,7 @@ _MOST_COPIES = 45  # and of near-symmetric copies of the best of them
 class Hypothesis:
     """A refined pose and the evidence for it."""
 
-    refined: RefinedPose  #: the pose, with its covariance and residual
+    refined: PoseFit  #: the pose, with its covariance and residual
     evidence: Evidence  #: of the pose
     #: mean angle between a network's directions and those to the keypoints of the pose; None
     #: without a network.
@@ -70,7 +70,7 @@ class Competition:
 
 def compete(
     cloud_m: Float64[Tensor, "n 3"],
-    refined: RefinedPose,
+    refined: PoseFit,
     others: Rigid,
     prepared: PreparedObject,
     observation: Observation,
@@ -91,7 +91,7 @@ def compete(
         votes_rad: mean angle between a network's directions and those to the keypoints of a pose.
     """
 
-    def hypothesize(pose: RefinedPose) -> Hypothesis:
+    def hypothesize(pose: PoseFit) -> Hypothesis:
         """Compare a refined pose with all that was observed."""
         camera_from_model = pose.camera_from_model.double()
         return Hypothesis(
@@ -165,11 +165,11 @@ def _merge_same_poses(
 
 def _refine_different_poses(
     cloud_m: Float64[Tensor, "n 3"],
-    leading: RefinedPose,
+    leading: PoseFit,
     others: Rigid,
     prepared: PreparedObject,
     config: EstimateConfig,
-) -> list[RefinedPose]:
+) -> list[PoseFit]:
     """List the leading pose, and refined others that are neither it nor a copy of one before.
 
     Others are the ones given, and the look-alikes of the leading pose.
@@ -251,11 +251,11 @@ def _log_without_depth(hypothesis: Hypothesis) -> float:
 
 def _refine_distinct_copies(
     cloud_m: Float64[Tensor, "n 3"],
-    winner: RefinedPose,
+    winner: PoseFit,
     prepared: PreparedObject,
     config: EstimateConfig,
     view: ViewInput | None,
-) -> list[RefinedPose]:
+) -> list[PoseFit]:
     """Refine the near-symmetric copies of the winning pose; leave out exact copies of others."""
     winner_pose = winner.camera_from_model.double()
     starts = winner_pose @ prepared.copies.near_copies
@@ -266,7 +266,7 @@ def _refine_distinct_copies(
     )
 
     is_same = partial(prepared.copies.is_same, motions=prepared.copies.symmetries)
-    distinct: list[RefinedPose] = []
+    distinct: list[PoseFit] = []
     distinct_poses = [winner_pose]
     for competitor in competitors:
         refined, start = competitor
@@ -287,7 +287,7 @@ def _refine_distinct_copies(
     return distinct
 
 
-def _undo_drift(refined: RefinedPose, start: RefinedPose, axis: Axis | None) -> RefinedPose:
+def _undo_drift(refined: PoseFit, start: PoseFit, axis: Axis | None) -> PoseFit:
     """Rotate a refined pose about an axis of its model back to the angle at which it started.
 
     Without an axis it is put back to its start, which nothing refined.
@@ -330,8 +330,8 @@ def _with_color_of_best_copy(
 class _Competitor(NamedTuple):
     """A competing pose, refined and as it was proposed."""
 
-    refined: RefinedPose
-    unrefined: RefinedPose
+    refined: PoseFit
+    unrefined: PoseFit
 
 
 def _compute_log_color(pose: Rigid, prepared: PreparedObject, view: ViewInput) -> float:
@@ -341,7 +341,7 @@ def _compute_log_color(pose: Rigid, prepared: PreparedObject, view: ViewInput) -
 
 def _refine_competitors(
     cloud_m: Float64[Tensor, "n 3"],
-    leading: RefinedPose,
+    leading: PoseFit,
     starts: Rigid,
     surface: Surface,
     config: EstimateConfig,
@@ -356,7 +356,7 @@ def _refine_competitors(
 
     # Roughly. Such steps let a pose drift along what little constrains it, so it stays at its start
     # where that explains as much.
-    rough = refine_roughly(cloud_m, starts, surface, config.icp)
+    rough = refine_roughly(cloud_m, starts, surface, config.icp.end_distance_diameters)
     unexplained_before = _measure_unexplained(cloud_m, starts, surface)
     unexplained_after = _measure_unexplained(cloud_m, rough, surface)
     is_better = unexplained_after < unexplained_before
@@ -376,13 +376,16 @@ def _refine_competitors(
         return []
 
     # Then exactly, a few steps for each.
-    short = replace(
-        config.icp,
+    batch = refine_exactly(
+        cloud_m,
+        improved[order],
+        surface,
         iterations=_STEPS,
-        cloud_points=min(_POINTS, config.icp.cloud_points),
-        start_distance_diameters=config.icp.end_distance_diameters,
+        start_diameters=config.icp.end_distance_diameters,
+        end_diameters=config.icp.end_distance_diameters,
+        max_points=min(_POINTS, config.icp.cloud_points),
+        sensor_offset_m=config.icp.sensor_offset_m,
     )
-    batch = refine_pose(cloud_m, improved[order], surface, short)
     competitors: list[_Competitor] = []
     for k, number in enumerate(order.tolist()):
         competitors.append(_Competitor(batch[k], unrefined[number]))

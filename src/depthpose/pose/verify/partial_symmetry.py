@@ -10,7 +10,6 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
-from depthpose.pose.config import IcpConfig
 from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.icp import refine_roughly
 from depthpose.pose.mesh import true_symmetries
@@ -61,7 +60,7 @@ def find_partial_symmetries(model: ObjectModel) -> dict[str, Any]:
     # Refined as poses before a camera in the middle of the model, from where all is visible.
     points_m = surface.points_m - surface.middle_m
     starts = Rigid(candidates.R, candidates.t_m - surface.middle_m)
-    candidates = refine_roughly(points_m, starts, surface, IcpConfig())
+    candidates = refine_roughly(points_m, starts, surface)
     candidates = Rigid(candidates.R, candidates.t_m + surface.middle_m)
     candidates = candidates[_choose_partial_symmetries(candidates, surface).indices]
 
