@@ -28,7 +28,7 @@ from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.geometry.surface import prepare_surface
-from depthpose.pose.icp import refine_pose
+from depthpose.pose.icp import refine_exactly
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.synthetic.depth_sensors import simulate_depth
 from depthpose.pose.synthetic.random_numbers import random_rotation
@@ -69,12 +69,12 @@ def measure_view(
     sensor = SyntheticSensorConfig(
         kinds=(kind,), noise=(noise, noise), offset_m=(-offset_m, offset_m)
     )
-    icp = IcpConfig() if offset_m else IcpConfig(sensor_offset_m=0.0)
+    sensor_offset_m = IcpConfig.sensor_offset_m if offset_m else 0.0
     squares, errors_mm, deviations_mm = [], [], []
     for _ in range(repeats):
         depth_m = simulate_depth(scene_m, (FOCAL_PX, FOCAL_PX), sensor, generator)
         cloud_m = cloud_from_depth(depth_m, mask & depth_m.isfinite(), K.float())
-        refined = refine_pose(cloud_m.double(), truth, surface, icp)
+        refined = refine_exactly(cloud_m.double(), truth, surface, sensor_offset_m=sensor_offset_m)
         motion = motion_to_truth(refined.camera_from_model, truth)
         squares.append(motion @ torch.linalg.solve(refined.covariance, motion))
         errors_mm.append(1000 * jacobian @ motion)

@@ -26,9 +26,9 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import cloud_from_depth
-from depthpose.pose.config import EstimateConfig, IcpConfig
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.geometry.surface import prepare_surface
-from depthpose.pose.icp import RefinedPose, refine_pose
+from depthpose.pose.icp import refine_exactly
 from depthpose.pose.mesh import (
     NearSymmetry,
     SymmetryProposal,
@@ -44,7 +44,7 @@ from depthpose.pose.mesh import (
 from depthpose.pose.metrics import add_m
 from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic.parts import make_part
-from depthpose.pose.types import ObjectModel, Symmetries, ViewInput
+from depthpose.pose.types import ObjectModel, PoseFit, Symmetries, ViewInput
 from depthpose.pose.verify import hypotheses
 from depthpose.pose.verify.evidence import observe
 from depthpose.pose.verify.hypotheses import compete
@@ -145,8 +145,7 @@ def test_copies_of_a_plate_stay_where_its_symmetry_has_them(seed: int) -> None:
     prepared = PreparedObject(number=0, model=plate, surface=prepare_surface(plate))
 
     leading = truth @ half_turn([1.0, 0.0, 0.0])
-    config = IcpConfig(start_distance_diameters=0.05)
-    refined = refine_pose(cloud_m, leading, prepared.surface, config)
+    refined = refine_exactly(cloud_m, leading, prepared.surface, start_diameters=0.05)
     observation = observe(cloud_m, view, prepared.surface, is_masked=True)
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
     competition = compete(cloud_m, refined, none, prepared, observation, EstimateConfig())
@@ -155,13 +154,13 @@ def test_copies_of_a_plate_stay_where_its_symmetry_has_them(seed: int) -> None:
     assert min(errors) < 0.004
 
 
-def turned_about_near_axis(prepared: PreparedObject, pose: Rigid, degrees: float) -> RefinedPose:
+def turned_about_near_axis(prepared: PreparedObject, pose: Rigid, degrees: float) -> PoseFit:
     """A pose after a rotation about the axis of the object's near-symmetric copies."""
     axis = prepared.copies.near_axis
     assert axis is not None
     angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
     turn = turn_about(axis.direction.double(), axis.point_m.double(), angle)
-    return RefinedPose(
+    return PoseFit(
         camera_from_model=pose @ turn, covariance=torch.eye(6), residual_m=torch.zeros(()),
         inlier_share=torch.ones(()),
     )  # fmt: skip

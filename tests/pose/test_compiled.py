@@ -14,13 +14,12 @@ from torch import Tensor
 
 from depthpose.core.rigid import Rigid, perturb, rotation_by
 from depthpose.pose import compiled
-from depthpose.pose.config import IcpConfig
 from depthpose.pose.geometry.kdtree import build_tree, find_nearest_points
 from depthpose.pose.geometry.surface import Surface, look_along_rays, match, prepare_surface
 from depthpose.pose.icp import (
     Residuals,
-    _refine_batch,
     build_normal_equations,
+    icp,
     make_rotation,
     refine_roughly,
     tukey_weight,
@@ -67,7 +66,7 @@ def test_nearest_surface_points(surface: Surface) -> None:
     generator = torch.Generator().manual_seed(1)
     asked_m = surface.diameter_m * torch.randn(3, 300, 3, generator=generator).double()
     _, expected = KDTree(surface.points_m.numpy()).query(asked_m.numpy())
-    assert torch.equal(surface.nearest(asked_m), torch.from_numpy(expected))
+    assert torch.equal(surface.nearest(asked_m).sample, torch.from_numpy(expected))
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 100])
@@ -162,7 +161,7 @@ def test_residuals_of_a_pose(surface: Surface) -> None:
     pose = poses(surface, 1)[0]
     cloud_m = seen(surface, pose)
     limit_m = 0.05 * surface.diameter_m
-    _, found = _refine_batch(cloud_m, 800, pose, surface, [limit_m], is_exact=False)
+    _, found = icp(cloud_m, pose, surface, distances_m=[limit_m], max_points=800, is_exact=False)
     local_m = pose.inverse().apply(cloud_m)
     index = surface.boxes.look_up(local_m)
     sample_m = surface.points_m[index]
@@ -313,7 +312,7 @@ def test_what_is_not_finite_is_refused(surface: Surface) -> None:
         lambda: surface.boxes.look_up(cloud_m),
         lambda: look_along_rays(cloud_m, pose, surface),
         lambda: look_along_rays(cloud_m[5:], strange, surface),
-        lambda: refine_roughly(cloud_m[5:], strange, surface, IcpConfig()),
+        lambda: refine_roughly(cloud_m[5:], strange, surface),
     )
     for call in calls:
         with pytest.raises(ValueError, match="finite"):
@@ -323,10 +322,10 @@ def test_what_is_not_finite_is_refused(surface: Surface) -> None:
 def test_what_has_gradients_is_taken_without_them(surface: Surface) -> None:
     starts = poses(surface, 2)
     cloud_m = seen(surface, starts[0])
-    plain = refine_roughly(cloud_m, starts, surface, IcpConfig())
+    plain = refine_roughly(cloud_m, starts, surface)
     with torch.enable_grad():
         learned = Rigid(starts.R, starts.t_m.clone().requires_grad_())
-        refined = refine_roughly(cloud_m, learned, surface, IcpConfig())
+        refined = refine_roughly(cloud_m, learned, surface)
     assert torch.equal(refined.t_m, plain.t_m)
     assert not refined.t_m.requires_grad
 

@@ -11,8 +11,7 @@ from tests.pose.synthetic_objects import pose_at
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.icp import RefinedPose
-from depthpose.pose.types import Alternative, Evidence, PoseEstimate
+from depthpose.pose.types import Alternative, Evidence, PoseEstimate, PoseFit
 from depthpose.pose.verify.decide import explain_doubt, seconds_of_all, with_status
 from depthpose.pose.verify.hypotheses import (
     Competition,
@@ -41,7 +40,7 @@ BAD = replace(
 
 
 def hypothesis(evidence: Evidence, votes_rad: float | None = None, color: float = 0) -> Hypothesis:
-    refined = RefinedPose(
+    refined = PoseFit(
         camera_from_model=pose_at().double(),
         covariance=torch.eye(6),
         residual_m=torch.tensor(0.001),

@@ -12,7 +12,7 @@ from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.geometry.grid import voxelise
 from depthpose.pose.geometry.surface import prepare_surface
-from depthpose.pose.icp import refine_pose
+from depthpose.pose.icp import refine_exactly
 from depthpose.pose.metrics import add_m
 from depthpose.pose.propose import (
     find_consistent_keypoints,
@@ -187,6 +187,6 @@ def test_the_whole_way_on_the_real_cat(real: Path) -> None:
     assert float(misfit(*found)) < 3
     error_m = add_m(fit.camera_from_model, true, model.vertices_m[::7])
     assert float(error_m) < 0.02 * model.diameter_m
-    refined = refine_pose(points, fit.camera_from_model, prepare_surface(model))
+    refined = refine_exactly(points, fit.camera_from_model, prepare_surface(model))
     error_m = add_m(refined.camera_from_model, true, model.vertices_m[::7])
     assert float(error_m) < 0.025 * model.diameter_m

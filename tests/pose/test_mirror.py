@@ -19,7 +19,7 @@ from tests.pose.synthetic_objects import (
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.geometry.surface import Surface, prepare_surface
-from depthpose.pose.icp import refine_pose
+from depthpose.pose.icp import refine_exactly
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate
@@ -55,7 +55,7 @@ def gain(seen: ObjectModel, seed: int, origin_m: float = 0.0) -> float:
     surface = surface_off_origin(origin_m)
     begun = Rigid(truth.R.double(), (truth.t_m - truth.R @ shift_m).double())
     return measure_mirror_gain(
-        cloud_m, refine_pose(cloud_m, begun, surface).camera_from_model, surface
+        cloud_m, refine_exactly(cloud_m, begun, surface).camera_from_model, surface
     )
 
 

@@ -17,12 +17,18 @@ from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.geometry.surface import Surface, prepare_surface
-from depthpose.pose.icp import _estimate_covariance, _Linearised, refine_best, refine_pose
+from depthpose.pose.icp import (
+    Linearised,
+    _estimate_covariance,
+    refine_best,
+    refine_exactly,
+    rotate_starts,
+)
 from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
 from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
 from depthpose.pose.synthetic.depth_sensors import simulate_depth
-from depthpose.pose.types import ObjectModel, Symmetries
+from depthpose.pose.types import ObjectModel, PoseFit, Symmetries
 from depthpose.report.pose import select_object_points
 
 ORIGIN = torch.zeros(3).double()
@@ -57,6 +63,12 @@ def seen_half(stone: ObjectModel, pose: Rigid, count: int = 3000) -> torch.Tenso
     return moved[(moved * (normals.double() @ pose.R.mT)).sum(-1) < 0]
 
 
+def refine_from_rotated(cloud_m: Tensor, poses: Rigid, surface: Surface) -> tuple[PoseFit, Rigid]:
+    """The best of seven starts from each pose."""
+    rotated = rotate_starts(poses.double(), surface, 7)
+    return refine_best(cloud_m, poses, surface, IcpConfig(), rotated)
+
+
 TRUE = perturb(
     Rigid(torch.eye(3).double(), torch.zeros(3).double()),
     torch.tensor([0.5, -0.8, 0.3, 0.05, -0.02, 0.8]).double(),
@@ -67,12 +79,12 @@ def test_a_near_pose_becomes_the_true_one(stone: ObjectModel, surface: Surface) 
     cloud = seen_half(stone, TRUE)
     starts = [pose_near(TRUE, seed, math.radians(8), 0.005) for seed in range(4)]
     batch = Rigid(torch.stack([s.R for s in starts]), torch.stack([s.t_m for s in starts]))
-    refined = refine_pose(cloud, batch, surface)
+    refined = refine_exactly(cloud, batch, surface)
     assert float(geodesic_rad(refined.camera_from_model.R, TRUE.R.expand(4, 3, 3)).max()) < 2e-3
     assert float((refined.camera_from_model.t_m - TRUE.t_m).norm(dim=-1).max()) < 3e-4
     assert refined.inlier_share.min() == 1
     assert float(refined.residual_m.max()) < 2e-4
-    one = refine_pose(cloud, starts[2], surface).camera_from_model
+    one = refine_exactly(cloud, starts[2], surface).camera_from_model
     assert torch.allclose(one.R, refined.camera_from_model.R[2], atol=1e-4)
 
 
@@ -82,8 +94,8 @@ def test_the_refined_pose_turns_with_the_cloud(stone: ObjectModel, surface: Surf
     motion = perturb(
         Rigid(torch.eye(3).double(), ORIGIN), torch.tensor([0.3, 0.4, -0.8, 0, 0, 0]).double()
     )
-    here = refine_pose(cloud, start, surface).camera_from_model
-    there = refine_pose(motion.apply(cloud), motion @ start, surface).camera_from_model
+    here = refine_exactly(cloud, start, surface).camera_from_model
+    there = refine_exactly(motion.apply(cloud), motion @ start, surface).camera_from_model
     assert torch.allclose((motion @ here).R, there.R, atol=1e-9)
     assert torch.allclose((motion @ here).t_m, there.t_m, atol=1e-9)
 
@@ -91,8 +103,8 @@ def test_the_refined_pose_turns_with_the_cloud(stone: ObjectModel, surface: Surf
 def test_far_points_have_no_say(stone: ObjectModel, surface: Surface) -> None:
     cloud = seen_half(stone, TRUE)
     wrong = cloud[::3] + torch.tensor([0.1, 0, 0])
-    clean = refine_pose(cloud, pose_near(TRUE, 6, 0.05, 0.003), surface)
-    mixed = refine_pose(torch.cat([cloud, wrong]), pose_near(TRUE, 6, 0.05, 0.003), surface)
+    clean = refine_exactly(cloud, pose_near(TRUE, 6, 0.05, 0.003), surface)
+    mixed = refine_exactly(torch.cat([cloud, wrong]), pose_near(TRUE, 6, 0.05, 0.003), surface)
     error_m = add_m(mixed.camera_from_model, clean.camera_from_model, stone.vertices_m)
     assert float(error_m) < 0.01 * stone.diameter_m
     assert float(mixed.inlier_share) < float(clean.inlier_share) - 0.1
@@ -100,7 +112,7 @@ def test_far_points_have_no_say(stone: ObjectModel, surface: Surface) -> None:
 
 def test_a_pose_that_meets_nothing_stays(stone: ObjectModel, surface: Surface) -> None:
     away = Rigid(TRUE.R, TRUE.t_m + torch.tensor([0.5, 0, 0]))
-    refined = refine_pose(seen_half(stone, TRUE), away, surface)
+    refined = refine_exactly(seen_half(stone, TRUE), away, surface)
     assert torch.allclose(refined.camera_from_model.t_m, away.t_m)
     assert float(refined.inlier_share) == 0
     assert math.isinf(float(refined.residual_m))
@@ -111,10 +123,10 @@ def test_a_far_turn_ends_at_the_true_pose_and_turns_about_the_object(
 ) -> None:
     """At 0.8 m a turn of 25 degrees about the camera would carry the object away by its size."""
     start = pose_near(TRUE, 3, math.radians(25), 0.0)
-    refined = refine_pose(seen_half(stone, TRUE), start, surface)
+    refined = refine_exactly(seen_half(stone, TRUE), start, surface)
     assert float(geodesic_rad(refined.camera_from_model.R, TRUE.R)) < 5e-3
     far = TRUE.t_m + torch.tensor([0, 0, 5.0])
-    moved = refine_pose(
+    moved = refine_exactly(
         seen_half(stone, TRUE) + torch.tensor([0, 0, 5.0]), Rigid(start.R, far), surface
     )
     assert torch.allclose(moved.camera_from_model.t_m, refined.camera_from_model.t_m
@@ -125,11 +137,24 @@ def test_the_best_of_several_starts_is_found(stone: ObjectModel, surface: Surfac
     cloud = seen_half(stone, TRUE)
     given = [pose_near(TRUE, seed, turn, 0.01) for seed, turn in ((0, 2.0), (1, 0.35), (2, 1.5))]
     batch = Rigid(torch.stack([g.R for g in given]), torch.stack([g.t_m for g in given]))
-    best = refine_best(cloud, batch, surface)
-    assert float(geodesic_rad(best.refined.camera_from_model.R, TRUE.R)) < 5e-3
-    assert 1 <= len(best.others.R) <= 3
-    sure = refine_best(cloud, pose_near(TRUE, 5, 0.05, 0.002), surface)
-    assert len(sure.others.R) == 0
+    best, others = refine_from_rotated(cloud, batch, surface)
+    assert float(geodesic_rad(best.camera_from_model.R, TRUE.R)) < 5e-3
+    assert 1 <= len(others.R) <= 3
+    _, others = refine_from_rotated(cloud, pose_near(TRUE, 5, 0.05, 0.002)[None], surface)
+    assert len(others.R) == 0
+
+
+def test_rotated_starts_are_turned_about_the_middle_of_the_object(surface: Surface) -> None:
+    given = Rigid.stack([TRUE, pose_near(TRUE, 0, 0.5, 0.01)])
+    assert len(rotate_starts(given, surface, 1).R) == 0
+    rotated = rotate_starts(given, surface, 7)
+    assert len(rotated.R) == 6 * len(given.R)
+    middle_m = surface.points_m.mean(0)[None]
+    for k in range(6):
+        of_rotation = rotated[slice(2 * k, 2 * k + 2)]
+        angle = geodesic_rad(of_rotation.R, given.R)
+        assert torch.allclose(angle, torch.full_like(angle, math.radians(15)))
+        assert torch.allclose(of_rotation.apply(middle_m), given.apply(middle_m))
 
 
 def test_a_pose_that_would_hide_what_was_seen_is_not_the_best() -> None:
@@ -142,8 +167,8 @@ def test_a_pose_that_would_hide_what_was_seen_is_not_the_best() -> None:
     face = seen[(seen - TRUE.t_m) @ toward > 0.0149]
     # Pushed toward the camera by its thickness, its far side lies where the near one was seen.
     batch = Rigid(TRUE.R.expand(2, 3, 3), torch.stack([TRUE.t_m + 0.03 * toward, TRUE.t_m]))
-    best = refine_best(face, batch, prepare_surface(plate))
-    assert float(((best.refined.camera_from_model.t_m - TRUE.t_m) @ toward).abs()) < 1e-3
+    best, _ = refine_from_rotated(face, batch, prepare_surface(plate))
+    assert float(((best.camera_from_model.t_m - TRUE.t_m) @ toward).abs()) < 1e-3
 
 
 def test_a_shelf_whose_upper_board_was_seen_is_not_posed_by_its_lower_one() -> None:
@@ -163,8 +188,8 @@ def test_a_shelf_whose_upper_board_was_seen_is_not_posed_by_its_lower_one() -> N
     seen_m = true.apply(points_m[points_m[:, 2] < -0.0019])
     lower = Rigid(true.R, true.t_m - 0.03 * true.R[:, 2])
     batch = Rigid(true.R.expand(2, 3, 3), torch.stack([lower.t_m, true.t_m]))
-    best = refine_best(seen_m, batch, prepare_surface(shelf))
-    off_m = (best.refined.camera_from_model.t_m - true.t_m) @ true.R[:, 2]
+    best, _ = refine_from_rotated(seen_m, batch, prepare_surface(shelf))
+    off_m = (best.camera_from_model.t_m - true.t_m) @ true.R[:, 2]
     assert float(off_m.abs()) < 1e-3
 
 
@@ -183,7 +208,7 @@ def test_a_thin_plate_is_not_found_on_its_back(kind: str) -> None:
         faces[::every] = faces[::every].flip(1)
         plate = make_model(vertices, faces, name="plate")
     start = Rigid(TRUE.R, TRUE.t_m + 0.008 * toward)
-    found = refine_pose(seen, start, prepare_surface(plate)).camera_from_model
+    found = refine_exactly(seen, start, prepare_surface(plate)).camera_from_model
     assert float(((found.t_m - TRUE.t_m) @ toward).abs()) < 5e-4
 
 
@@ -195,7 +220,7 @@ def test_noise_along_the_ray_draws_nothing_nearer() -> None:
     for seed in range(8):
         generator = torch.Generator().manual_seed(seed)
         noise = torch.randn(len(clean_m), 1, generator=generator, dtype=torch.float64)
-        found = refine_pose(clean_m * (1 + 0.003 / clean_m[:, 2:] * noise), true, part)
+        found = refine_exactly(clean_m * (1 + 0.003 / clean_m[:, 2:] * noise), true, part)
         offs_m.append(found.camera_from_model.t_m[2] - true.t_m[2])
     assert abs(float(torch.stack(offs_m).mean())) < 4e-4
 
@@ -216,11 +241,12 @@ def test_another_pose_of_a_symmetric_part_is_kept() -> None:
     swapped = TRUE @ about
     points_m = sample_surface(model, 4000)[0].double()
     seen_m = points_m[(points_m[:, 0] < 0.01) & (points_m[:, 1] < 0.05)]
-    found = refine_best(TRUE.apply(seen_m), Rigid.stack([TRUE, swapped]), prepare_surface(model))
-    best = found.refined.camera_from_model.double()
+    both = Rigid.stack([TRUE, swapped])
+    found, others = refine_from_rotated(TRUE.apply(seen_m), both, prepare_surface(model))
+    best = found.camera_from_model.double()
     other = swapped if float(geodesic_rad(best.R, TRUE.R)) < 0.1 else TRUE
     copies = [other, other @ half_turn[0]]
-    gaps_m = [float(add_m(p, c, vertices)) for p in found.others for c in copies]
+    gaps_m = [float(add_m(p, c, vertices)) for p in others for c in copies]
     assert min(gaps_m) < 0.05 * model.diameter_m
 
 
@@ -231,8 +257,8 @@ def test_what_a_start_won_is_not_lost_on_the_way() -> None:
     start = pose_near(
         Rigid(truth.R.double(), truth.t_m.double()), 46, math.radians(25), 0.15 * model.diameter_m
     )
-    found = refine_best(cloud_of(model, truth), start, part).refined.camera_from_model
-    assert float(add_m(found, truth, model.vertices_m)) < 0.01 * model.diameter_m
+    found, _ = refine_from_rotated(cloud_of(model, truth), start[None], part)
+    assert float(add_m(found.camera_from_model, truth, model.vertices_m)) < 0.01 * model.diameter_m
 
 
 def test_exact_steps_end_no_worse_than_rough_ones() -> None:
@@ -247,7 +273,7 @@ def test_exact_steps_end_no_worse_than_rough_ones() -> None:
     start = pose_near(
         Rigid(truth.R.double(), truth.t_m.double()), 155, math.radians(50), 0.12 * model.diameter_m
     )
-    found = refine_best(cloud_of(model, truth), start, prepare_surface(model)).refined
+    found, _ = refine_from_rotated(cloud_of(model, truth), start[None], prepare_surface(model))
     assert float(add_m(found.camera_from_model, truth, model.vertices_m)) < 1e-3 * model.diameter_m
 
 
@@ -256,7 +282,7 @@ def test_one_step_is_checked_by_the_last_limit(stone: ObjectModel, surface: Surf
     noise = torch.randn(cloud.shape, generator=torch.Generator().manual_seed(0)).double()
     cloud = cloud + 0.04 * stone.diameter_m * noise
     shares = [
-        float(refine_pose(cloud, TRUE, surface, IcpConfig(iterations=count)).inlier_share)
+        float(refine_exactly(cloud, TRUE, surface, iterations=count).inlier_share)
         for count in (1, 30)
     ]
     assert shares[0] == pytest.approx(shares[1], abs=0.05)
@@ -268,7 +294,7 @@ def test_its_covariance_is_honest(stone: ObjectModel, surface: Surface) -> None:
         generator = torch.Generator().manual_seed(seed)
         cloud = seen_half(stone, TRUE, 900)
         cloud = cloud + 0.001 * torch.randn(cloud.shape, generator=generator, dtype=torch.float64)
-        refined = refine_pose(cloud, TRUE, surface, IcpConfig(sensor_offset_m=0.0))
+        refined = refine_exactly(cloud, TRUE, surface, sensor_offset_m=0.0)
         turn = TRUE.R @ refined.camera_from_model.R.T
         rotation = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0],
                                 turn[1, 0] - turn[0, 1]]) / 2  # fmt: skip
@@ -299,7 +325,7 @@ def test_its_covariance_covers_the_errors_of_sensors(kind: SensorKind) -> None:
                 clean_m.nan_to_num(0.8).float(), (400.0, 400.0), sensor, generator
             )
             cloud_m = cloud_from_depth(depth_m, mask & depth_m.isfinite(), K.float()).double()
-            found = refine_pose(cloud_m, true, part, IcpConfig(sensor_offset_m=0.0))
+            found = refine_exactly(cloud_m, true, part, sensor_offset_m=0.0)
             middle_m = found.camera_from_model.apply(part.points_m.mean(0)[None])[0]
             std_m = (by @ found.covariance @ by.mT).diagonal().sqrt()
             times.append((middle_m - at_m).abs() / std_m)
@@ -314,7 +340,7 @@ def test_an_offset_of_the_sensor_is_in_the_covariance_along_the_ray() -> None:
     model, pose = bracket(), pose_at(seed=3)
     cloud_m, true = cloud_of(model, pose).double(), Rigid(pose.R.double(), pose.t_m.double())
     part = bracket_surface()
-    found = [refine_pose(cloud_m, true, part, IcpConfig(sensor_offset_m=offset_m))
+    found = [refine_exactly(cloud_m, true, part, sensor_offset_m=offset_m)
              for offset_m in (0.0, 0.004)]  # fmt: skip
     more = found[1].covariance - found[0].covariance
     middle_m = cloud_m.mean(0)
@@ -327,7 +353,7 @@ def test_what_a_surface_does_not_fix_is_uncertain() -> None:
     vertices = torch.from_numpy(np.array(ball.vertices))
     model = make_model(vertices, torch.from_numpy(np.array(ball.faces)), name="ball")
     pose = Rigid(torch.eye(3).double(), torch.tensor([0, 0, 0.5]).double())
-    refined = refine_pose(seen_half(model, pose), pose, prepare_surface(model))
+    refined = refine_exactly(seen_half(model, pose), pose, prepare_surface(model))
     at_centre = torch.eye(6).double()
     at_centre[3:, :3] = -torch.tensor([[0, -0.5, 0], [0.5, 0, 0], [0, 0, 0]]).double()
     own = at_centre @ refined.covariance @ at_centre.mT
@@ -357,7 +383,7 @@ def test_the_real_cat_and_ape(real: Path) -> None:
                   for seed in range(5)]  # fmt: skip
         batch = Rigid(torch.stack([s.R for s in starts]), torch.stack([s.t_m for s in starts]))
         points_m = select_object_points(sample.input, model.diameter_m)
-        refined = refine_pose(points_m, batch, prepare_surface(model))
+        refined = refine_exactly(points_m, batch, prepare_surface(model))
         known = Rigid(true.R.expand(5, 3, 3), true.t_m.expand(5, 3))
         error_m = add_m(refined.camera_from_model, known, model.vertices_m[::7])
         assert float(error_m.max()) < 0.025 * model.diameter_m
@@ -370,15 +396,16 @@ def test_nothing_and_no_numbers_are_refused() -> None:
         (torch.zeros(0, 3), "ICP of 0 points, 0 of them not finite"),
         (torch.full((40, 3), torch.nan), "ICP of 40 points, 40 of them"),
     ):
-        for refine in (refine_pose, refine_best):
-            with pytest.raises(InputError, match=said):
-                refine(cloud, start, surface)
+        with pytest.raises(InputError, match=said):
+            refine_exactly(cloud, start, surface)
+        with pytest.raises(InputError, match=said):
+            refine_best(cloud, start, surface, IcpConfig())
 
 
 def covariance_of(
     cloud_m: Tensor, H: Tensor, J: Tensor, weight: Tensor, residual_m: Tensor, limit_m: float
 ) -> Tensor:
-    return _estimate_covariance(cloud_m, _Linearised(H, J, weight, residual_m), limit_m, 0.2)
+    return _estimate_covariance(cloud_m, Linearised(H, J, weight, residual_m), limit_m, 0.2)
 
 
 def test_a_covariance_of_few_points_is_finite_and_symmetric() -> None:

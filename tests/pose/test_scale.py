@@ -20,7 +20,7 @@ from depthpose.core.loop import make_sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.geometry.surface import prepare_surface
-from depthpose.pose.icp import refine_pose
+from depthpose.pose.icp import refine_exactly
 from depthpose.pose.types import PoseEstimate
 from depthpose.pose.verify.identity import Scale, measure_scale
 
@@ -31,7 +31,7 @@ TRUTH = pose_at(seed=1)
 def test_the_scale_of_a_copy_is_measured(times: float) -> None:
     model = bracket()
     surface, cloud_m = bracket_surface(), noisy(cloud_of(scaled(model, times), TRUTH))
-    begun = refine_pose(cloud_m.double(), Rigid(TRUTH.R.double(), TRUTH.t_m.double()), surface)
+    begun = refine_exactly(cloud_m.double(), Rigid(TRUTH.R.double(), TRUTH.t_m.double()), surface)
     scale = measure_scale(cloud_m, begun.camera_from_model, surface)
     assert scale.times == pytest.approx(times, abs=0.012)
     assert scale.sigma < 0.02

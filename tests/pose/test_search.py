@@ -90,7 +90,7 @@ def test_normals_are_those_of_the_surface() -> None:
     assert not bool(frame.is_smooth[~mask].any())
     inner = frame.is_smooth & mask
     local_m = TRUTHS[0].inverse().apply(frame.points_m[inner].float()).double()
-    index = surface.nearest(local_m)
+    index = surface.nearest(local_m).sample
     cosine = (frame.normals[inner] * (surface.normals[index] @ TRUTHS[0].R.double().mT)).sum(-1)
     assert float((cosine.abs() > 0.98).double().mean()) > 0.85, "all but those at edges"
     assert bool(((frame.normals * frame.points_m).sum(-1)[inner] < 0).all()), "toward the camera"

@@ -94,8 +94,8 @@ class VotingConfig(Settings):
 class IcpConfig(Settings):
     """How a pose is brought onto the cloud."""
 
-    iterations: Annotated[int, "[1, inf)"] = 30
-    """Largest number of exact steps from one start; half of them after the best of several."""
+    iterations: Annotated[int, "[1, inf)"] = 15
+    """Largest number of exact steps, which follow rough ones."""
 
     start_distance_diameters: float = 0.1
     """Points farther from the surface have weight 0 in the first step."""

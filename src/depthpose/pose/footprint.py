@@ -12,7 +12,7 @@ from depthpose.core.camera.pinhole import Window, crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.frame import Frame, share_behind
 from depthpose.pose.geometry.rendering import find_window_about
-from depthpose.pose.geometry.surface import NEAR, Surface
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.types import KnownBackground, ViewInput
 
 _REGION_MARGIN = 0.5
@@ -24,8 +24,9 @@ _MOST_SUNK = 0.05
 def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
     """Mark the pixels in a view's mask whose readings lie on a posed surface."""
     pose = pose.double()
-    near_m = NEAR * surface.diameter_m
-    window = find_window_about(surface, pose, view.K.double(), *view.depth_m.shape, margin_m=near_m)
+    window = find_window_about(
+        surface, pose, view.K.double(), *view.depth_m.shape, margin_m=surface.near_m
+    )
     part = _crop_view(view, window)
     points_m = back_project(part.depth_m.double(), part.K.double())
     is_candidate = (part.depth_m > 0) & part.depth_m.isfinite() & part.mask
@@ -37,8 +38,9 @@ def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tenso
 def explained_frame_mask(frame: Frame, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
     """Mark the pixels of a frame, outside its background, whose readings lie on a posed surface."""
     pose = pose.double()
-    near_m = NEAR * surface.diameter_m
-    window = find_window_about(surface, pose, frame.K, *frame.depth_m.shape, margin_m=near_m)
+    window = find_window_about(
+        surface, pose, frame.K, *frame.depth_m.shape, margin_m=surface.near_m
+    )
     is_candidate = (frame.depth_m[window] > 0) & frame.may_show(surface.diameter_m, window)
     explained = torch.zeros(frame.depth_m.shape, dtype=torch.bool)
     explained[window] = _lies_on_surface(frame.points_m[window], is_candidate, pose, surface)
@@ -53,18 +55,16 @@ def _lies_on_surface(
 ) -> Bool[Tensor, "h w"]:
     """Mark the candidates among points of the camera frame that lie on a posed surface."""
     local_m = pose.inverse().apply(points_m[is_candidate])
-    distance_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
+    distance_m = surface.nearest(local_m, is_exact=False).distance_m
 
     # The sample of a point's box is farther than its nearest one by the box's diagonal at most:
     # only between these limits the nearest is searched.
-    limit_m = NEAR * surface.diameter_m
     diagonal_m = math.sqrt(3) * surface.boxes.side_m
-    is_undecided = (distance_m >= limit_m) & (distance_m < limit_m + diagonal_m)
-    nearest_m = surface.points_m[surface.nearest(local_m[is_undecided])]
-    distance_m[is_undecided] = (local_m[is_undecided] - nearest_m).norm(dim=-1)
+    is_undecided = (distance_m >= surface.near_m) & (distance_m < surface.near_m + diagonal_m)
+    distance_m[is_undecided] = surface.nearest(local_m[is_undecided]).distance_m
 
     is_explained = is_candidate.clone()
-    is_explained[is_candidate] = distance_m < limit_m
+    is_explained[is_candidate] = distance_m < surface.near_m
     return is_explained
 
 
@@ -117,7 +117,7 @@ def why_background_excludes(frame: Frame, pose: Rigid, surface: Surface) -> str:
     for background in frame.backgrounds:
         if background.diameter_m < surface.diameter_m:  # the plane may be a side of the object
             continue
-        share = share_behind(frame, background, points_m, NEAR * surface.diameter_m)
+        share = share_behind(frame, background, points_m, surface.near_m)
         if share > _MOST_SUNK:
             return f"{share:.0%} of it would lie in the bin, table or wall before which it is seen"
     return ""

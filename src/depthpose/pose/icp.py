@@ -1,7 +1,8 @@
 """Point-to-plane ICP: refines poses of a model's surface on a cloud."""
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,24 +22,27 @@ from depthpose.pose.geometry.surface import (
     look_along_rays,
     match,
 )
+from depthpose.pose.types import PoseFit
 
 _SLACK = 0.1  # sine of the angle up to which a surface that faces away counts as visible
 _GRAZING = 0.1  # sine of the angle between a ray and a plane below which they do not meet nearby
 _CONVERGED = 3e-4  # ICP stops when a step rotates [rad] and shifts [diameters] by less than this
 _LEAST_INFORMATION = 1e-6  # a step is damped by a billionth of it at least
 _START_ROTATION_RAD = math.radians(15)  # angle between the initial pose and further starts
-_ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
-"""Distance limits of the rough steps, over the last limit of the exact steps: a start may be far
-from the points."""
+_STEPS_ALONE = 30  # exact steps of a pose that no rough ones brought near
+_ROUGH_DISTANCES = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
+"""Distances of the rough steps, over the last one of the exact steps: a start may be far from the
+points."""
 _ROUGH_POINTS = 100  # points of the cloud that refine and compare starts
 _OCCLUSION_POINTS = 1000  # points of the cloud by which free-space violations are counted
 _OCCLUSION_EVERY = 4  # one in this many points of the surface is used for that
 _COMPARED_POINTS = 50  # points of the model, about, by which poses are told to be distinct
 _DISTINCT_DIAMETERS = 0.1  # mean distance between the surfaces of two poses that are distinct
 _MOST_OTHERS = 3  # largest number of local minima that are returned beside the best
-_FIRST_POSE_BONUS = 0.02
-"""Added to the score of the first pose, which is a share of points near the surface. Another pose
-must be better by more: a plane fits at many poses, and noise would choose among them."""
+_TRUSTED_BONUS = 0.02
+"""Added to the score of the pose that is trusted more, which is a share of points near the surface:
+the first of several, and what exact steps from a start end at. Another pose must be better by more:
+a plane fits at many poses, and noise would choose among them."""
 
 _BLOCK_DIAMETERS = (0.15, 0.2, 0.3, 0.4)  # sides of the blocks that the jackknife leaves out
 _LEAST_REMAINING = 0.03
@@ -47,36 +51,6 @@ alone constrains a direction would else make it infinitely uncertain."""
 _LEAST_SLOPE = 0.25
 """Least ratio of the information with Tukey's weights, which change with the residuals, to the
 information with the weights held constant."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RefinedPose:
-    """A refined pose, with leading batch axes of the poses that it began from."""
-
-    camera_from_model: Rigid  #: the pose
-    #: of (rotation, translation) as in :class:`~depthpose.pose.types.PoseFit`. It allows for
-    #: correlated residuals and for an offset of all readings along the ray
-    #: (``IcpConfig.sensor_offset_m``). A motion that the surface leaves free, such as a rotation of
-    #: a ball, has a very large variance. It describes this local minimum, right or wrong.
-    covariance: Float[Tensor, "*batch 6 6"]
-    residual_m: Float[Tensor, "*batch"]  #: weighted root mean square distance to the surface
-    inlier_share: Float[Tensor, "*batch"]  #: share of the points within the last limit
-
-    def __getitem__(self, index: int) -> "RefinedPose":
-        """Take one pose of a batch."""
-        return RefinedPose(
-            camera_from_model=self.camera_from_model[index],
-            covariance=self.covariance[index],
-            residual_m=self.residual_m[index],
-            inlier_share=self.inlier_share[index],
-        )
-
-
-class BestStart(NamedTuple):
-    """The best of several refined poses."""
-
-    refined: RefinedPose  #: the best
-    others: Rigid  #: poses that compete with it, roughly refined or proposed
 
 
 class Residuals(NamedTuple):
@@ -90,13 +64,18 @@ class Residuals(NamedTuple):
     weight: Float64[np.ndarray, " n"]  #: by ``tukey_weight``
 
 
-class _Linearised(NamedTuple):
+class Linearised(NamedTuple):
     """Refined poses' residuals, and their information about (rotation, translation)."""
 
     information: Float64[Tensor, "*batch 6 6"]  #: damped
     jacobian: Float64[Tensor, "*batch n 6"]  #: of the residuals
     weight: Float64[Tensor, "*batch n"]  #: of each point
     residual_m: Float64[Tensor, "*batch n"]  #: of each point
+
+    @property
+    def inlier_share(self) -> Float64[Tensor, "*batch"]:
+        """Share of the points that count, being nearer than the last distance."""
+        return (self.weight > 0).double().mean(-1)
 
     @property
     def rms_m(self) -> Float64[Tensor, "*batch"]:
@@ -127,52 +106,162 @@ def _differentiate_influence(
     return root * (root - 4 * (residual_m / limit_m).square())
 
 
-def refine_pose(
-    points_m: Float[Tensor, "n 3"],
-    initial: Rigid,
+def icp(
+    points_m: Float[Tensor, "m 3"],
+    poses: Rigid,
     surface: Surface,
-    config: IcpConfig | None = None,
-) -> RefinedPose:
-    """Move poses so that the cloud lies on the surface; all of a batch at once.
+    *,
+    distances_m: Sequence[float],
+    max_points: int,
+    is_exact: bool,
+) -> tuple[Rigid, Linearised]:
+    """Move poses so that the cloud lies on the surface: point-to-plane ICP, of each by itself.
 
     Every point of a partial cloud has a place on the whole model, so points seek the surface and
     not the reverse. Each step minimises ``sum w (n . (T^-1 x - s))^2`` over the nearest surface
     point ``s`` with normal ``n`` (Chen and Medioni 1991) that faces the camera; the weight is
-    Tukey's, and its limit shrinks from ``start_distance`` to ``end_distance``. In the second half
-    of the steps ``s`` is where the ray of ``x`` meets the surface, for noise is along the ray. The
-    nearest point would do harm there: of a reading that noise puts behind an edge it lies on
-    another face, and such readings draw the model toward the camera.
+    Tukey's. In the second half of exact steps ``s`` is where the ray of ``x`` meets the surface,
+    for noise is along the ray. The nearest point would do harm there: of a reading that noise puts
+    behind an edge it lies on another face, and such readings draw the model toward the camera.
 
-    Where no point of the cloud comes near the surface a pose stays as it was, with an
-    ``inlier_share`` of 0.
+    Where no point of the cloud comes near the surface a pose stays as it was.
 
     Args:
         points_m: points of the object, in the camera frame.
-        initial: poses to begin from, ``camera_from_model``; one or a batch.
+        poses: poses to begin from, ``camera_from_model``, in float64; one or a batch.
         surface: of :func:`~depthpose.pose.geometry.surface.prepare_surface`.
-        config: limits and number of steps.
+        distances_m: distance from the surface at which a point's weight is 0: one for each
+            Gauss-Newton step, and a last one for the residuals, after which no step follows.
+        max_points: largest number of points that are used, evenly taken.
+        is_exact: whether the nearest surface points are searched in a tree, not looked up in a
+            table (:class:`~depthpose.pose.geometry.surface.NearestTable`), which is faster.
+
+    Returns:
+        The refined poses, and the residuals and the information of each.
 
     Raises:
         InputError: there is no point, or one is not finite.
     """
-    config = IcpConfig() if config is None else config
-    # The limit shrinks in even ratios over half of the steps, then stays; then the compiled loop
-    # matches along rays. A last limit is for the residuals of the final pose.
-    start = config.start_distance_diameters
-    end = config.end_distance_diameters
-    half = max(1, config.iterations // 2)
-    limits = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
-    limits_m = [limit * surface.diameter_m for limit in (*limits, end)]
-    pose, equations = _refine_batch(
-        points_m, config.cloud_points, initial.double(), surface, limits_m, is_exact=True
+    if len(points_m) == 0 or not bool(points_m.isfinite().all()):
+        raise InputError(
+            f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
+            "not finite: leave those out, and refuse a cloud of none."
+        )
+
+    # The compiled loop changes rotations and translations in place, and writes the residuals of
+    # each pose into a row of these arrays.
+    cloud = array_of(take_evenly(points_m.double(), max_points))
+    R = array_of(poses.R).copy()
+    t_m = array_of(poses.t_m).copy()
+    rotations = R.reshape(-1, 3, 3)
+    translations = t_m.reshape(-1, 3)
+    batch = (len(translations), len(cloud))
+    jacobian = np.zeros((*batch, 6))
+    weight = np.zeros(batch)
+    residual_m = np.zeros(batch)
+    information = np.empty((batch[0], 6, 6))
+    for k in range(batch[0]):
+        information[k] = _gauss_newton(
+            cloud,
+            rotations[k],
+            translations[k],
+            np.array(distances_m),
+            surface.diameter_m,
+            surface.target,
+            is_exact,
+            Residuals(jacobian[k], residual_m[k], weight[k]),
+        )
+
+    # Back to the batch axes of the poses.
+    shape = poses.t_m.shape[:-1]
+    parts = (information, jacobian, weight, residual_m)
+    tensors = [torch.from_numpy(part).reshape(*shape, *part.shape[1:]) for part in parts]
+    return Rigid(torch.from_numpy(R), torch.from_numpy(t_m)), Linearised(*tensors)
+
+
+def refine_roughly(
+    points_m: Float[Tensor, "n 3"],
+    poses: Rigid,
+    surface: Surface,
+    end_diameters: float = IcpConfig.end_distance_diameters,
+) -> Rigid:
+    """Refine a batch of poses fast: by a hundred points and the table of surface points.
+
+    Args:
+        points_m: points of the object, in the camera frame.
+        poses: in float64, ``camera_from_model``.
+        surface: of the model.
+        end_diameters: distance of the last step.
+
+    Raises:
+        InputError: there is no point, or one is not finite.
+    """
+    end_m = end_diameters * surface.diameter_m
+    distances_m = [ratio * end_m for ratio in _ROUGH_DISTANCES]
+    refined, _ = icp(
+        points_m,
+        poses,
+        surface,
+        distances_m=distances_m,
+        max_points=_ROUGH_POINTS,
+        is_exact=False,
+    )
+    return refined
+
+
+def refine_exactly(
+    points_m: Float[Tensor, "n 3"],
+    poses: Rigid,
+    surface: Surface,
+    *,
+    iterations: int = _STEPS_ALONE,
+    start_diameters: float = IcpConfig.start_distance_diameters,
+    end_diameters: float = IcpConfig.end_distance_diameters,
+    max_points: int = IcpConfig.cloud_points,
+    sensor_offset_m: float = IcpConfig.sensor_offset_m,
+) -> PoseFit:
+    """Refine poses by the nearest surface points, and estimate their covariance.
+
+    The covariance allows for correlated residuals, and for an offset of all readings along the ray.
+    A motion that the surface leaves free, such as a rotation of a ball, has a very large variance.
+
+    Args:
+        points_m: points of the object, in the camera frame.
+        poses: poses to begin from, ``camera_from_model``; one or a batch.
+        surface: of the model.
+        iterations: largest number of steps.
+        start_diameters: distance of the first step; it shrinks in even ratios over half of the
+            steps, then stays.
+        end_diameters: distance of the last steps, and of the inliers.
+        max_points: largest number of points that are used, evenly taken.
+        sensor_offset_m: standard deviation of an offset of all readings.
+
+    Returns:
+        The fits, with the batch axes of ``poses``. Where no point comes near the surface the pose
+        is the one given, and its ``inlier_share`` 0.
+
+    Raises:
+        InputError: there is no point, or one is not finite.
+    """
+    half = max(1, iterations // 2)
+    ratio = end_diameters / start_diameters
+    distances = [start_diameters * ratio ** min(1.0, step / half) for step in range(iterations)]
+    distances_m = [distance * surface.diameter_m for distance in (*distances, end_diameters)]
+    refined, equations = icp(
+        points_m,
+        poses.double(),
+        surface,
+        distances_m=distances_m,
+        max_points=max_points,
+        is_exact=True,
     )
 
     # Covariance about the middle of the cloud, of the residuals and of an offset along the ray.
-    cloud_m = take_evenly(points_m.double(), config.cloud_points)
-    covariance = _estimate_covariance(cloud_m, equations, limits_m[-1], surface.diameter_m)
+    cloud_m = take_evenly(points_m.double(), max_points)
+    covariance = _estimate_covariance(cloud_m, equations, distances_m[-1], surface.diameter_m)
     middle_m = cloud_m.mean(0)
     ray = torch.nn.functional.normalize(middle_m, dim=0)
-    offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), ray])
+    offset_m = sensor_offset_m * torch.cat([torch.zeros(3), ray])
     covariance = covariance + torch.outer(offset_m, offset_m)
 
     # The same about the camera: w x (p - c) + v = w x p + (v + c x w).
@@ -182,61 +271,110 @@ def refine_pose(
     translation_rows = torch.cat([cross_matrix(middle_m), eye], 1)
     camera_from_middle = torch.cat([rotation_rows, translation_rows])
     covariance = camera_from_middle @ covariance @ camera_from_middle.mT
-    return RefinedPose(
-        camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
+    return PoseFit(
+        camera_from_model=Rigid(refined.R.to(points_m), refined.t_m.to(points_m)),
         covariance=covariance.to(points_m),
         residual_m=equations.rms_m.to(points_m),
-        inlier_share=(equations.weight > 0).to(points_m).mean(-1),
+        inlier_share=equations.inlier_share.to(points_m),
     )
 
 
 def refine_best(
     points_m: Float[Tensor, "n 3"],
-    initial: Rigid,
+    poses: Rigid,
     surface: Surface,
-    config: IcpConfig | None = None,
-) -> BestStart:
-    """Refine poses, and rotated copies of each, and choose the one that explains the cloud best.
-
-    All are refined roughly (:func:`refine_roughly`). Each is scored by the share of points near the
-    surface, less free-space violations and part of the unobserved surface. The best is refined
-    exactly, in half of the steps.
+    config: IcpConfig,
+    rotated: Rigid | None = None,
+) -> tuple[PoseFit, Rigid]:
+    """Refine poses roughly, choose the one that explains the cloud best, and refine it exactly.
 
     Args:
         points_m: points of the object, in the camera frame.
-        initial: ``camera_from_model``, one or several; the first is trusted most.
-        surface: of :func:`~depthpose.pose.geometry.surface.prepare_surface`.
-        config: ``starts`` and what :func:`refine_pose` takes.
+        poses: ``camera_from_model``, one or several; the first is trusted most.
+        surface: of the model.
+        config: settings of the exact steps.
+        rotated: further starts (:func:`rotate_starts`), in float64; None: the poses alone.
+
+    Returns:
+        The best pose, and up to three other local minima, roughly refined, in float64.
 
     Raises:
         InputError: there is no point, or one is not finite.
     """
-    config = IcpConfig() if config is None else config
+    # Coarse, on all of them.
+    poses = Rigid(poses.R.reshape(-1, 3, 3), poses.t_m.reshape(-1, 3)).double()
+    starts = poses if rotated is None else Rigid.cat([poses, rotated])
+    rough = refine_roughly(points_m, starts, surface, config.end_distance_diameters)
 
-    # The best of all starts, roughly refined.
-    initial = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
-    starts = _add_rotated_starts(initial.double(), surface, config.starts)
-    rough = refine_roughly(points_m, starts, surface, config)
+    # The best of them.
     end_m = config.end_distance_diameters * surface.diameter_m
     score = _score_poses(points_m, rough, surface, end_m)
+    score[0] += _TRUSTED_BONUS
     best = int(score.argmax())
 
-    # The starts are the initial poses, then their rotated copies in the same order.
-    is_initial = best < len(initial.R)
-    start = initial[best] if is_initial else None
-    refined = _refine_exactly(points_m, start, rough[best], surface, config)
+    # Fine, on that one.
+    start = poses[best] if best < len(poses.R) else None
+    refined = _refine_chosen(points_m, start, rough[best], surface, config)
     others = _choose_distinct_poses(rough, score, refined.camera_from_model.double(), surface)
-    return BestStart(refined=refined, others=others)
+    return refined, others
 
 
-def _refine_exactly(
+def rotate_starts(poses: Rigid, surface: Surface, starts: int) -> Rigid:
+    """Rotate poses about the object's middle by 15 degrees, for ICP to start from too.
+
+    Args:
+        poses: a batch, ``camera_from_model``, in float64.
+        surface: of the model.
+        starts: from each pose, 1 to 7: the pose itself, then rotated about the x, y and z axis of
+            the camera, then the other way.
+
+    Returns:
+        The rotated poses, without the given ones: those of the first rotation first.
+    """
+    eye = torch.eye(3, dtype=torch.float64)
+    axes = torch.cat([eye, -eye])[: starts - 1]
+    rotations = rotation_by(_START_ROTATION_RAD * axes)[:, None]
+    middle_m = poses.R @ surface.points_m.mean(0) + poses.t_m
+    t_m = (rotations @ (poses.t_m - middle_m)[..., None]).squeeze(-1) + middle_m
+    return Rigid((rotations @ poses.R).flatten(0, 1), t_m.flatten(0, 1))
+
+
+def _score_poses(
+    points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
+) -> Float64[Tensor, " b"]:
+    """Score poses by how they explain a cloud.
+
+    A score is the share of points near the surface, less their distance, free-space violations and
+    part of the unobserved surface.
+    """
+    # What the posed surface would hide, and what of it was not observed.
+    cloud_m = take_evenly(points_m.double(), _OCCLUSION_POINTS)
+    free_space_violation, unobserved = look_along_rays(
+        cloud_m, poses, surface, every=_OCCLUSION_EVERY
+    )
+
+    # How many points lie near it. Of poses with equal shares the nearer one is better.
+    few_m = take_evenly(cloud_m, _ROUGH_POINTS)
+    _, equations = icp(
+        few_m,
+        poses,
+        surface,
+        distances_m=[limit_m],  # no step: matches and residuals alone
+        max_points=_ROUGH_POINTS,
+        is_exact=False,
+    )
+    closeness = equations.inlier_share - equations.rms_m / surface.diameter_m
+    return closeness - free_space_violation - UNOBSERVED_WEIGHT * unobserved
+
+
+def _refine_chosen(
     points_m: Float[Tensor, "n 3"],
     start: Rigid | None,
     rough: Rigid,
     surface: Surface,
     config: IcpConfig,
-) -> RefinedPose:
-    """Refine the best start exactly, in half of the steps, from before or after its rough steps.
+) -> PoseFit:
+    """Refine the best start exactly, from before or after its rough steps.
 
     Exact steps begin from the pose before, since rough steps let a pose drift where it is weakly
     constrained. They begin from the pose after where that explains the cloud better: the start was
@@ -244,35 +382,29 @@ def _refine_exactly(
 
     Args:
         points_m: points of the object, in the camera frame.
-        start: the initial pose; None where it is a rotated copy, of which the rough end is used.
+        start: the pose before; None where it is a rotated start, of which the rough end is used.
         rough: the pose after rough steps from the start.
         surface: of the model.
-        config: of all steps.
+        config: settings of the exact steps.
     """
-    half = replace(config, iterations=(config.iterations + 1) // 2)
+    end_diameters = config.end_distance_diameters
+    refine = partial(
+        refine_exactly,
+        points_m,
+        surface=surface,
+        iterations=config.iterations,
+        end_diameters=end_diameters,
+        max_points=config.cloud_points,
+        sensor_offset_m=config.sensor_offset_m,
+    )
     if start is not None:
-        from_start = refine_pose(points_m, start, surface, half)
+        from_start = refine(start, start_diameters=config.start_distance_diameters)
         ends = Rigid.stack([from_start.camera_from_model.double(), rough])
-        end_m = config.end_distance_diameters * surface.diameter_m
+        end_m = end_diameters * surface.diameter_m
         score_exact, score_rough = _score_poses(points_m, ends, surface, end_m).tolist()
-        if score_rough <= score_exact:
+        if score_rough <= score_exact + _TRUSTED_BONUS:
             return from_start
-    near = replace(half, start_distance_diameters=config.end_distance_diameters)
-    return refine_pose(points_m, rough, surface, near)
-
-
-def _add_rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
-    """Append all poses again, rotated about the object's middle by each of the camera's axes.
-
-    ``number`` is the starts from each pose, 1 to 7: itself, then rotated by 15 degrees about x, y
-    and z, then the other way.
-    """
-    axes = torch.eye(3, dtype=torch.float64)
-    axes = torch.cat([torch.zeros(1, 3).double(), axes, -axes])[:number]
-    rotations = rotation_by(_START_ROTATION_RAD * axes)[:, None]
-    middle_m = poses.R @ surface.points_m.mean(0) + poses.t_m
-    t_m = (rotations @ (poses.t_m - middle_m)[..., None]).squeeze(-1) + middle_m
-    return Rigid((rotations @ poses.R).flatten(0, 1), t_m.flatten(0, 1))
+    return refine(rough, start_diameters=end_diameters)
 
 
 def _choose_distinct_poses(
@@ -299,86 +431,6 @@ def _choose_distinct_poses(
     return poses[chosen]
 
 
-def refine_roughly(
-    points_m: Float[Tensor, "n 3"], starts: Rigid, surface: Surface, config: IcpConfig
-) -> Rigid:
-    """Refine a batch of poses fast: with a hundred points and a table of nearest samples.
-
-    Args:
-        points_m: points of the object, in the camera frame.
-        starts: poses in float64, ``camera_from_model``.
-        surface: of the model; its table is :class:`~depthpose.pose.geometry.surface.NearestTable`.
-        config: ``end_distance_diameters`` is used.
-    """
-    end_m = config.end_distance_diameters * surface.diameter_m
-    limits_m = [ratio * end_m for ratio in _ROUGH_LIMITS]
-    poses, _ = _refine_batch(points_m, _ROUGH_POINTS, starts, surface, limits_m, is_exact=False)
-    return poses
-
-
-def _refine_batch(
-    points_m: Float[Tensor, "m 3"],
-    max_points: int,
-    pose: Rigid,
-    surface: Surface,
-    limits_m: list[float],
-    *,
-    is_exact: bool,
-) -> tuple[Rigid, _Linearised]:
-    """Refine poses, each by itself, and compute their residuals then (:func:`_gauss_newton`).
-
-    Args:
-        points_m: points of the object, in the camera frame.
-        max_points: largest number of points that are used, evenly taken.
-        pose: one or a batch, ``camera_from_model``.
-        surface: of the model.
-        limits_m: distance from which a point has no weight: one for each Gauss-Newton step, and a
-            last one for the residuals that are returned, after which no step follows.
-        is_exact: whether the nearest samples are searched, not looked up in a table.
-
-    Returns:
-        The refined poses, and the residuals and the information of each.
-
-    Raises:
-        InputError: there is no point, or one is not finite.
-    """
-    if len(points_m) == 0 or not bool(points_m.isfinite().all()):
-        raise InputError(
-            f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
-            "not finite: leave those out, and refuse a cloud of none."
-        )
-
-    # The compiled loop changes rotations and translations in place, and writes the residuals of
-    # each pose into a row of these arrays.
-    cloud = array_of(take_evenly(points_m.double(), max_points))
-    R = array_of(pose.R).copy()
-    t_m = array_of(pose.t_m).copy()
-    rotations = R.reshape(-1, 3, 3)
-    translations = t_m.reshape(-1, 3)
-    batch = (len(translations), len(cloud))
-    jacobian = np.zeros((*batch, 6))
-    weight = np.zeros(batch)
-    residual_m = np.zeros(batch)
-    information = np.empty((batch[0], 6, 6))
-    for k in range(batch[0]):
-        information[k] = _gauss_newton(
-            cloud,
-            rotations[k],
-            translations[k],
-            np.array(limits_m),
-            surface.diameter_m,
-            surface.target,
-            is_exact,
-            Residuals(jacobian[k], residual_m[k], weight[k]),
-        )
-
-    # Back to the batch axes of the poses.
-    shape = pose.t_m.shape[:-1]
-    parts = (information, jacobian, weight, residual_m)
-    tensors = [torch.from_numpy(part).reshape(*shape, *part.shape[1:]) for part in parts]
-    return Rigid(torch.from_numpy(R), torch.from_numpy(t_m)), _Linearised(*tensors)
-
-
 @compiled
 def _gauss_newton(
     cloud: Float64[np.ndarray, "n 3"],
@@ -399,7 +451,7 @@ def _gauss_newton(
         cloud: in the camera frame.
         R: rotation of the pose; changed.
         t: its translation; changed.
-        limits: as of :func:`_refine_batch`.
+        limits: ``distances_m`` of :func:`icp`.
         diameter: of the object.
         target: samples of the surface.
         is_exact: whether the nearest samples are searched, not looked up in a table.
@@ -544,31 +596,6 @@ def _linearise(
         residuals.weight[i] = weight
 
 
-def _score_poses(
-    points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
-) -> Float64[Tensor, " b"]:
-    """Score poses by how they explain a cloud; the first one, which is trusted more, gets a bonus.
-
-    A score is the share of points near the surface, less their distance, free-space violations and
-    part of the unobserved surface.
-    """
-    # What the posed surface would hide, and what of it was not observed.
-    cloud_m = take_evenly(points_m.double(), _OCCLUSION_POINTS)
-    free_space_violation, unobserved = look_along_rays(
-        cloud_m, poses, surface, every=_OCCLUSION_EVERY
-    )
-
-    # How many points lie near it. Of poses with equal shares the nearer one is better.
-    few_m = take_evenly(cloud_m, _ROUGH_POINTS)
-    limits_m = [limit_m]  # no step: matches and residuals alone
-    _, equations = _refine_batch(few_m, _ROUGH_POINTS, poses, surface, limits_m, is_exact=False)
-    inlier_share = (equations.weight > 0).double().mean(-1)
-    closeness = inlier_share - equations.rms_m / surface.diameter_m
-    score = closeness - free_space_violation - UNOBSERVED_WEIGHT * unobserved
-    score[0] += _FIRST_POSE_BONUS
-    return score
-
-
 @compiled
 def build_normal_equations(
     residuals: Residuals, least_size: float
@@ -629,7 +656,7 @@ def make_rotation(motion: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 3
 
 def _estimate_covariance(
     cloud_m: Float64[Tensor, "n 3"],
-    equations: _Linearised,
+    equations: Linearised,
     limit_m: float,
     diameter_m: float,
 ) -> Float64[Tensor, "*batch 6 6"]:
@@ -660,7 +687,7 @@ def _estimate_covariance(
 
 
 def _factor_independent_covariance(
-    equations: _Linearised, slope: Float64[Tensor, "*batch n"]
+    equations: Linearised, slope: Float64[Tensor, "*batch n"]
 ) -> tuple[
     Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 1 1"]
 ]:
@@ -690,7 +717,7 @@ def _factor_independent_covariance(
 
 def _measure_inflation(
     cloud_m: Float64[Tensor, "n 3"],
-    equations: _Linearised,
+    equations: Linearised,
     slope: Float64[Tensor, "*batch n"],
     independent: Float64[Tensor, "*batch 6 6"],
     whitening: Float64[Tensor, "*batch 6 6"],

@@ -29,7 +29,7 @@ from depthpose.pose.cloud import ObjectCloud, cloud_from_depth, prepare_cloud, w
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
 from depthpose.pose.geometry.grid import VoxelGrid, sample_and_voxelise
-from depthpose.pose.icp import BestStart, RefinedPose, refine_best
+from depthpose.pose.icp import refine_best, rotate_starts
 from depthpose.pose.networks.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
 from depthpose.pose.pipeline import judge, propose_by_pairs
 from depthpose.pose.propose import fit_poses, meet_lines, vote_ransac
@@ -294,35 +294,30 @@ class GeoPoseNet(PoseEstimator):
 
         # Refine; where ICP brings no point near the model, the fit of the keypoints stays.
         poses = fits.camera_from_model.double()
-        fitted = RefinedPose(
-            camera_from_model=poses[0],
-            covariance=fits.covariance[0],
-            residual_m=fits.residual_m[0],
-            inlier_share=torch.ones(()),
-        )
-        refinement = BestStart(refined=fitted, others=poses[:0])
+        refined = fits[0]
+        others = poses[:0]
         if config.with_icp:
             with watch.stage("icp"):
                 cloud_m = job.cloud.cloud_m.double()
-                by_icp = refine_best(cloud_m, poses, prepared.surface, config.icp)
-            if float(by_icp.refined.inlier_share) > 0:
-                refinement = by_icp
+                rotated = rotate_starts(poses, prepared.surface, config.icp.starts)
+                by_icp, minima = refine_best(cloud_m, poses, prepared.surface, config.icp, rotated)
+            if float(by_icp.inlier_share) > 0:
+                refined = by_icp
+                others = minima
 
         # Where little of a part is visible, all votes may mean the wrong end of it. Poses that
         # point pairs propose compete with the one that was voted for.
         if config.with_icp and is_expected and has_surface(prepared.model):
             with watch.stage("proposal"):
                 proposals = propose_by_pairs(job.cloud, prepared, config.voting.seed)
-            refinement = BestStart(
-                refined=refinement.refined,
-                others=Rigid.cat([refinement.others.double(), proposals]),
-            )
+            others = Rigid.cat([others, proposals])
 
         # Compare, compete, decide.
         estimate = judge(
             job.cloud,
             prepared,
-            refinement,
+            refined,
+            others,
             config,
             self.weights.refusal,
             watch,
@@ -451,7 +446,9 @@ class DepthImageRegressor(PoseEstimator):
         if (few := why_too_few(points_m, self._cloud)) is not None:
             return replace(estimate, status="too few points", reason=few, camera_from_model=None)
         with watch.stage("icp"):
-            refined = refine_best(points_m, pose, prepared.surface, self.config.icp).refined
+            icp = self.config.icp
+            rotated = rotate_starts(pose[None].double(), prepared.surface, icp.starts)
+            refined, _ = refine_best(points_m, pose, prepared.surface, icp, rotated)
         if float(refined.inlier_share) == 0:  # no point near the surface: nothing was refined
             return estimate
         free = free_motions(model.symmetries.continuous, refined.camera_from_model.double())

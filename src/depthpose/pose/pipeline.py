@@ -16,9 +16,9 @@ from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import ObjectCloud, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.geometry.grid import fit_local_planes, thin_cloud
-from depthpose.pose.icp import BestStart, refine_best
+from depthpose.pose.icp import refine_best
 from depthpose.pose.propose.point_pairs import propose_poses
-from depthpose.pose.types import AnyInput, PoseEstimate, Refusal
+from depthpose.pose.types import AnyInput, PoseEstimate, PoseFit, Refusal
 from depthpose.pose.verify.decide import decide, refused
 from depthpose.pose.verify.evidence import observe
 from depthpose.pose.verify.hypotheses import compete
@@ -62,16 +62,16 @@ def register(
         if proposals is None:
             proposals = propose_by_pairs(cloud, prepared, config.voting.seed)
 
-    # Refine, from each pose alone: the proposals are many.
+    # Refine.
     with watch.stage("icp"):
-        icp = replace(config.icp, starts=1)
-        refinement = refine_best(cloud.cloud_m.double(), proposals, prepared.surface, icp)
-    if float(refinement.refined.inlier_share) == 0:
+        cloud_m = cloud.cloud_m.double()
+        refined, others = refine_best(cloud_m, proposals, prepared.surface, config.icp)
+    if float(refined.inlier_share) == 0:
         reason = "no pose brings the model near the points: another object, or too little of it"
         return refused(pose_input, Refusal(status="no pose found", reason=reason), watch.seconds)
 
     # Compare, compete, decide.
-    return judge(cloud, prepared, refinement, config, refusal, watch, prior_odds=prior_odds)
+    return judge(cloud, prepared, refined, others, config, refusal, watch, prior_odds=prior_odds)
 
 
 def propose_by_pairs(cloud: ObjectCloud, prepared: PreparedObject, seed: int) -> Rigid:
@@ -87,7 +87,8 @@ def propose_by_pairs(cloud: ObjectCloud, prepared: PreparedObject, seed: int) ->
 def judge(
     cloud: ObjectCloud,
     prepared: PreparedObject,
-    refinement: BestStart,
+    refined: PoseFit,
+    others: Rigid,
     config: EstimateConfig,
     refusal: RefusalConfig,
     watch: Stopwatch,
@@ -100,7 +101,8 @@ def judge(
     Args:
         cloud: points of the object.
         prepared: the object.
-        refinement: the best pose, and others at which refinement ended.
+        refined: the best pose.
+        others: at which refinement ended too, or that were proposed.
         config: settings of the estimate; without ICP competing poses stay where they are.
         refusal: when it is withheld.
         watch: of the stages before, to which this one's are added.
@@ -115,8 +117,8 @@ def judge(
         has_color = cloud.view is not None and cloud.view.color is not None
         competition = compete(
             cloud.cloud_m.double(),
-            refinement.refined,
-            refinement.others,
+            refined,
+            others,
             prepared,
             observation,
             config,

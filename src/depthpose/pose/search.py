@@ -246,13 +246,13 @@ def _refine(
     Returns:
         The proposals that may be right, the likeliest first; and the hopeless ones.
     """
-    icp = targets.config.icp
+    end_diameters = targets.config.icp.end_distance_diameters
 
     def refine(place: _Place) -> tuple[Rigid, Evidence]:
         """Refine the pose of a place, and compare it with the image."""
         surface = targets.objects[place.object].surface
         cloud_m = _readings_of(place, frame, view)
-        pose = refine_roughly(cloud_m, place.pose[None], surface, icp)[0]
+        pose = refine_roughly(cloud_m, place.pose[None], surface, end_diameters)[0]
         observation = observe(cloud_m, view, surface, is_masked=False)
         return pose, compare(observation, pose, surface)
 

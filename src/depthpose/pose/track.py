@@ -239,8 +239,7 @@ def _follow(
         )
 
     # Refined, and the points that lie on it then.
-    icp = replace(target.config.icp, starts=1)
-    refined = refine_best(cloud_m, poses, surface, icp).refined
+    refined, _ = refine_best(cloud_m, poses, surface, target.config.icp)
     pose = refined.camera_from_model.double()
     object_m = scene_m[_mark_near(scene_m, pose[None], surface, NEAR) & ~is_support]
     if len(object_m) < _LEAST_POINTS:
@@ -399,6 +398,5 @@ def _mark_near(
 ) -> Bool[Tensor, " n"]:
     """Mark the points within a limit, in diameters, of the surface at one of several poses."""
     local_m = poses.inverse().apply(points_m)
-    nearest_m = surface.points_m[surface.boxes.look_up(local_m)]
-    gap_m = (local_m - nearest_m).norm(dim=-1)
-    return (gap_m < limit * surface.diameter_m).any(0)
+    distance_m = surface.nearest(local_m, is_exact=False).distance_m
+    return (distance_m < limit * surface.diameter_m).any(0)

@@ -238,7 +238,7 @@ class Vote:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseFit:
-    """The rigid transform that best carries the model's keypoints onto voted ones."""
+    """A pose fitted to voted keypoints or, by ICP, to points of the surface."""
 
     camera_from_model: Rigid  #: the pose
     #: of (rotation [rad], translation [m]), left perturbation in the camera frame: the true pose is
@@ -246,7 +246,19 @@ class PoseFit:
     #: well the data fix the pose about this one, and nothing of other poses, such as a half-turn
     #: away, that explain the data as well.
     covariance: Float[Tensor, "*batch 6 6"]
-    residual_m: Float[Tensor, "*batch"]  #: root mean square distance of the used keypoints
+    #: root mean square distance of the used keypoints, or of the used points from the surface,
+    #: weighted; infinite where none is used.
+    residual_m: Float[Tensor, "*batch"]
+    inlier_share: Float[Tensor, "*batch"]  #: share of the keypoints or points that are used
+
+    def __getitem__(self, index: int) -> "PoseFit":
+        """Take one fit of a batch."""
+        return PoseFit(
+            camera_from_model=self.camera_from_model[index],
+            covariance=self.covariance[index],
+            residual_m=self.residual_m[index],
+            inlier_share=self.inlier_share[index],
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -188,6 +188,13 @@ class Views:
     is_inner: Bool[Tensor, "v n"]
 
 
+class Nearest(NamedTuple):
+    """The surface points nearest to given points."""
+
+    sample: Int64[Tensor, "*batch n"]  #: its index among ``Surface.points_m``
+    distance_m: Float64[Tensor, "*batch n"]  #: to it
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
     """Samples of a model's surface, computed once and used for every cloud."""
@@ -205,10 +212,26 @@ class Surface:
     symmetries: Rigid  #: declared and found, ``model_from_model``, the identity first
     boxes: NearestTable  #: of near surface points, some thirty times as fast as a search
 
-    def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
-        """Find the index of the surface point nearest to each point of the model frame."""
-        index = find_nearest_points(array_of(points_m).reshape(-1, 3), self.target.tree)
-        return torch.from_numpy(index).reshape(points_m.shape[:-1])
+    @property
+    def near_m(self) -> float:
+        """Distance within which a point of the cloud lies on the posed surface."""
+        return NEAR * self.diameter_m
+
+    def nearest(self, local_m: Float64[Tensor, "*batch n 3"], *, is_exact: bool = True) -> Nearest:
+        """Find the surface point nearest to each point.
+
+        Args:
+            local_m: points in the model frame.
+            is_exact: whether the nearest one is searched. Else one near the point is looked up in
+                ``boxes``: for many poses, or where a distance off by a box is good enough.
+        """
+        if is_exact:
+            found = find_nearest_points(array_of(local_m).reshape(-1, 3), self.target.tree)
+            sample = torch.from_numpy(found).reshape(local_m.shape[:-1])
+        else:
+            sample = self.boxes.look_up(local_m)
+        distance_m = (local_m - self.points_m[sample]).norm(dim=-1)
+        return Nearest(sample, distance_m)
 
     @cached_property
     def plane_normals(self) -> Float64[Tensor, "f 3"]:

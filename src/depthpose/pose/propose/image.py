@@ -153,7 +153,7 @@ def _average_scene_points(
     """
     is_used = frame.is_smooth & is_unclaimed & frame.may_show(surface.diameter_m)
     # Where the noise is as large as the limit of nearness, no shape is visible.
-    is_used &= frame.noise_per_m2 * frame.depth_m.square() < NEAR * surface.diameter_m
+    is_used &= frame.noise_per_m2 * frame.depth_m.square() < surface.near_m
     points_m = frame.points_m[is_used]
     normals = frame.normals[is_used]
     if len(points_m) == 0:

@@ -497,6 +497,7 @@ def fit_pose(
         camera_from_model=Rigid(pose.R.to(keypoints_m), pose.t_m.to(keypoints_m)),
         covariance=torch.linalg.inv(H).to(keypoints_m),
         residual_m=mean_square_m2.sqrt().to(keypoints_m),
+        inlier_share=used.to(keypoints_m).mean(-1),
     )
 
 

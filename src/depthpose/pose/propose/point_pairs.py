@@ -249,14 +249,13 @@ def _score_poses(
     """
     # The cloud in the model frame, and the nearest points of the surface.
     inverse = poses.inverse()
-    local_m = points_m[:_SCORED_POINTS] @ inverse.R.mT + inverse.t_m[:, None]
+    local_m = inverse.apply(points_m[:_SCORED_POINTS])
     local_normals = normals[:_SCORED_POINTS] @ inverse.R.mT
-    index = surface.boxes.look_up(local_m)
-    limit_m = _NEAR_ROUGHLY * surface.diameter_m
-    is_near = (local_m - surface.points_m[index]).norm(dim=-1) < limit_m
+    nearest = surface.nearest(local_m, is_exact=False)
+    is_near = nearest.distance_m < _NEAR_ROUGHLY * surface.diameter_m
 
     # What supports each pose, and what contradicts it.
-    cosine = (local_normals * surface.normals[index]).sum(-1).abs()
+    cosine = (local_normals * surface.normals[nearest.sample]).sum(-1).abs()
     support = (is_near * cosine).mean(-1)
     free_space_violation, unobserved = look_along_rays(points_m, poses, surface, every=_RAYS_EVERY)
     return support - free_space_violation - UNOBSERVED_WEIGHT * unobserved

@@ -12,10 +12,10 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.geometry.surface import NEAR, Surface
-from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
+from depthpose.pose.geometry.surface import Surface
+from depthpose.pose.icp import refine_exactly, refine_roughly
 from depthpose.pose.mesh import turn_about
-from depthpose.pose.types import Axis, Evidence, ViewInput
+from depthpose.pose.types import Axis, Evidence, PoseFit, ViewInput
 from depthpose.pose.verify.color import measure_color_agreement
 from depthpose.pose.verify.color_copies import align_print, propose_color_copies
 from depthpose.pose.verify.evidence import Observation, compare
@@ -40,7 +40,7 @@ _MOST_COPIES = 45  # and of near-symmetric copies of the best of them
 class Hypothesis:
     """A refined pose and the evidence for it."""
 
-    refined: RefinedPose  #: the pose, with its covariance and residual
+    refined: PoseFit  #: the pose, with its covariance and residual
     evidence: Evidence  #: of the pose
     #: mean angle between a network's directions and those to the keypoints of the pose; None
     #: without a network.
@@ -70,7 +70,7 @@ class Competition:
 
 def compete(
     cloud_m: Float64[Tensor, "n 3"],
-    refined: RefinedPose,
+    refined: PoseFit,
     others: Rigid,
     prepared: PreparedObject,
     observation: Observation,
@@ -90,48 +90,36 @@ def compete(
         view: whose colour image tells copies apart; None: depth alone.
         votes_rad: mean angle between a network's directions and those to the keypoints of a pose.
     """
+    is_masked = observation.is_masked
+    hypothesize = partial(
+        _hypothesize, prepared=prepared, observation=observation, votes_rad=votes_rad
+    )
 
-    def hypothesize(pose: RefinedPose) -> Hypothesis:
-        """Compare a refined pose with all that was observed."""
-        camera_from_model = pose.camera_from_model.double()
-        return Hypothesis(
-            refined=pose,
-            evidence=compare(observation, camera_from_model, prepared.surface),
-            votes_rad=None if votes_rad is None else votes_rad(camera_from_model),
-            log_color=0.0
-            if view is None
-            else _compute_log_color(camera_from_model, prepared, view),
-        )
-
-    # Which pose is it, up to near-symmetric copies?
-    different = [
-        hypothesize(pose)
-        for pose in _refine_different_poses(cloud_m, refined, others, prepared, config)
-    ]
-    if view is not None:  # one of its copies may have the surface colours that are observed
+    # First round: which pose is it, up to near-symmetric copies? Each pose stands for its copies,
+    # one of which may have the surface colours that are observed.
+    different_fits = _refine_different_poses(cloud_m, refined, others, prepared, config)
+    different = [hypothesize(fit) for fit in different_fits]
+    if view is not None:
         different = _with_color_of_best_copy(different, prepared, view)
-    shares = share_among_poses(different, is_masked=observation.is_masked)
-    winner_number = int(shares.argmax())
-    winner = different[winner_number]
+    shares = share_among_poses(different, is_masked=is_masked)
+    winner = different[int(shares.argmax())]
 
-    # And which of its copies? Another of the different poses may be a copy of it too: one between
-    # two copies about an axis.
-    copies = [winner.refined]
-    copies += _refine_distinct_copies(cloud_m, winner.refined, prepared, config, view)
-    copy_poses = Rigid.stack([copy.camera_from_model.double() for copy in copies])
-    symmetries = _all_symmetries(prepared)
-    is_copy = [
-        bool(prepared.copies.is_same(hypothesis.pose, copy_poses, symmetries).any())
-        for hypothesis in different
-    ]
-    copies += [
+    # The winner's copies. Another of the different poses may be one too: one between two copies
+    # about an axis. Together they have the shares of all of these.
+    copies = _refine_distinct_copies(cloud_m, winner.refined, prepared, config, view)
+    is_copy = _mark_copies(different, [winner.refined, *copies], prepared)
+    joining = [
         hypothesis.refined
-        for hypothesis, belongs in zip(different, is_copy, strict=True)
-        if belongs and hypothesis is not winner
+        for hypothesis, joins in zip(different, is_copy, strict=True)
+        if joins and hypothesis is not winner
     ]
-    group = [hypothesize(pose) for pose in copies]  # each with its own colours
     group_share = float(shares[torch.tensor(is_copy)].sum())
-    copy_shares = group_share * share_among_copies(group, is_masked=observation.is_masked)
+
+    # Second round: which of the copies is it? Each has its own colours.
+    group = [hypothesize(fit) for fit in (winner.refined, *copies, *joining)]
+    if view is not None:
+        group = _with_own_color(group, prepared, view)
+    copy_shares = group_share * share_among_copies(group, is_masked=is_masked)
     distinct = _merge_same_poses(group, copy_shares.tolist(), prepared)
     best, best_share = max(distinct, key=lambda copy: copy[1])
     return Competition(
@@ -140,6 +128,33 @@ def compete(
         copies=[(copy, share) for copy, share in distinct if copy is not best],
         others=[(h, float(shares[k])) for k, h in enumerate(different) if not is_copy[k]],
     )
+
+
+def _hypothesize(
+    refined: PoseFit,
+    prepared: PreparedObject,
+    observation: Observation,
+    votes_rad: Callable[[Rigid], float] | None,
+) -> Hypothesis:
+    """Compare a refined pose with the depth that was observed, and with a network's votes."""
+    pose = refined.camera_from_model.double()
+    return Hypothesis(
+        refined=refined,
+        evidence=compare(observation, pose, prepared.surface),
+        votes_rad=None if votes_rad is None else votes_rad(pose),
+    )
+
+
+def _mark_copies(
+    hypotheses: Sequence[Hypothesis], copies: Sequence[PoseFit], prepared: PreparedObject
+) -> list[bool]:
+    """Mark the hypotheses at the pose of one of the copies, up to exact and near-symmetries."""
+    copy_poses = Rigid.stack([copy.camera_from_model.double() for copy in copies])
+    symmetries = _all_symmetries(prepared)
+    return [
+        bool(prepared.copies.is_same(hypothesis.pose, copy_poses, symmetries).any())
+        for hypothesis in hypotheses
+    ]
 
 
 def _merge_same_poses(
@@ -165,11 +180,11 @@ def _merge_same_poses(
 
 def _refine_different_poses(
     cloud_m: Float64[Tensor, "n 3"],
-    leading: RefinedPose,
+    leading: PoseFit,
     others: Rigid,
     prepared: PreparedObject,
     config: EstimateConfig,
-) -> list[RefinedPose]:
+) -> list[PoseFit]:
     """List the leading pose, and refined others that are neither it nor a copy of one before.
 
     Others are the ones given, and the look-alikes of the leading pose.
@@ -249,13 +264,20 @@ def _log_without_depth(hypothesis: Hypothesis) -> float:
     return log_votes + hypothesis.log_color
 
 
+class _Competitor(NamedTuple):
+    """A competing pose, refined and as it was proposed."""
+
+    refined: PoseFit
+    unrefined: PoseFit
+
+
 def _refine_distinct_copies(
     cloud_m: Float64[Tensor, "n 3"],
-    winner: RefinedPose,
+    winner: PoseFit,
     prepared: PreparedObject,
     config: EstimateConfig,
     view: ViewInput | None,
-) -> list[RefinedPose]:
+) -> list[PoseFit]:
     """Refine the near-symmetric copies of the winning pose; leave out exact copies of others."""
     winner_pose = winner.camera_from_model.double()
     starts = winner_pose @ prepared.copies.near_copies
@@ -265,44 +287,58 @@ def _refine_distinct_copies(
         cloud_m, winner, starts, prepared.surface, config, _MOST_COPIES
     )
 
-    is_same = partial(prepared.copies.is_same, motions=prepared.copies.symmetries)
-    distinct: list[RefinedPose] = []
+    distinct: list[PoseFit] = []
     distinct_poses = [winner_pose]
     for competitor in competitors:
-        refined, start = competitor
-        if view is not None:
-            # Depth lets a copy drift about an axis of its shape, where its print fixes the angle.
-            settled = align_print(refined.camera_from_model, prepared.model, view)
-            refined = replace(refined, camera_from_model=settled)
-        # Where little observed fixes a copy, refinement lets it drift toward others: both compete.
-        has_drifted = not is_same(refined.camera_from_model, start.camera_from_model[None]).any()
-        competing = [refined]
-        if has_drifted:
-            undone = _undo_drift(refined, start, prepared.copies.near_axis)
-            competing = [undone, refined]
-        for copy in competing:
-            if not bool(is_same(copy.camera_from_model, Rigid.stack(distinct_poses)).any()):
+        for copy in _settle_copy(competitor, prepared, view):
+            pose = copy.camera_from_model
+            before = Rigid.stack(distinct_poses)
+            if not prepared.copies.is_same(pose, before, prepared.copies.symmetries).any():
                 distinct.append(copy)
-                distinct_poses.append(copy.camera_from_model.double())
+                distinct_poses.append(pose.double())
     return distinct
 
 
-def _undo_drift(refined: RefinedPose, start: RefinedPose, axis: Axis | None) -> RefinedPose:
+def _settle_copy(
+    competitor: _Competitor, prepared: PreparedObject, view: ViewInput | None
+) -> list[PoseFit]:
+    """List where a copy may lie: where refinement ended and, if it drifted away, its start too.
+
+    Where little observed fixes a copy, refinement lets it drift toward others: both compete.
+    """
+    refined, start = competitor
+    if view is not None:
+        # Depth lets a copy drift about an axis of its shape, where its print fixes the angle.
+        settled = align_print(refined.camera_from_model, prepared.model, view)
+        refined = replace(refined, camera_from_model=settled)
+    copies = prepared.copies
+    start_pose = start.camera_from_model[None]
+    if copies.is_same(refined.camera_from_model, start_pose, copies.symmetries).any():
+        return [refined]
+    return [_undo_drift(refined, start, copies.near_axis), refined]
+
+
+def _undo_drift(refined: PoseFit, start: PoseFit, axis: Axis | None) -> PoseFit:
     """Rotate a refined pose about an axis of its model back to the angle at which it started.
 
     Without an axis it is put back to its start, which nothing refined.
     """
     if axis is None:
         return start
-    # The twist about the axis a of the rotation R since the start: tan(angle / 2) is the axial
-    # vector of R - R^T along a, over 1 + trace R.
     pose = refined.camera_from_model.double()
-    R = start.camera_from_model.R.double().mT @ pose.R
     direction = axis.direction.double()
-    axial = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    angle_rad = 2 * torch.atan2(axial @ direction, 1 + R.trace())
-    back = turn_about(direction, axis.point_m.double(), -angle_rad)
+    twist_rad = _measure_twist(start.camera_from_model.R.double().mT @ pose.R, direction)
+    back = turn_about(direction, axis.point_m.double(), -twist_rad)
     return replace(refined, camera_from_model=pose @ back)
+
+
+def _measure_twist(R: Float64[Tensor, "3 3"], axis: Float64[Tensor, "3"]) -> Float64[Tensor, ""]:
+    """Measure the angle [rad] of a rotation's twist about a unit axis (swing-twist decomposition).
+
+    tan(angle / 2) is the axial vector of R - R^T along the axis, over 1 + trace R.
+    """
+    axial = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return 2 * torch.atan2(axial @ axis, 1 + R.trace())
 
 
 def _with_color_of_best_copy(
@@ -327,21 +363,20 @@ def _with_color_of_best_copy(
     return distinct
 
 
-class _Competitor(NamedTuple):
-    """A competing pose, refined and as it was proposed."""
-
-    refined: RefinedPose
-    unrefined: RefinedPose
-
-
-def _compute_log_color(pose: Rigid, prepared: PreparedObject, view: ViewInput) -> float:
-    """Compute the log likelihood of a colour image at a pose; 0 where it or the model has none."""
-    return float(measure_color_agreement(pose[None], prepared.model, view).log_likelihood[0])
+def _with_own_color(
+    hypotheses: Sequence[Hypothesis], prepared: PreparedObject, view: ViewInput
+) -> list[Hypothesis]:
+    """Return poses with the colour evidence of each alone."""
+    colored: list[Hypothesis] = []
+    for hypothesis in hypotheses:
+        color = measure_color_agreement(hypothesis.pose[None], prepared.model, view)
+        colored.append(replace(hypothesis, log_color=float(color.log_likelihood[0])))
+    return colored
 
 
 def _refine_competitors(
     cloud_m: Float64[Tensor, "n 3"],
-    leading: RefinedPose,
+    leading: PoseFit,
     starts: Rigid,
     surface: Surface,
     config: EstimateConfig,
@@ -356,7 +391,7 @@ def _refine_competitors(
 
     # Roughly. Such steps let a pose drift along what little constrains it, so it stays at its start
     # where that explains as much.
-    rough = refine_roughly(cloud_m, starts, surface, config.icp)
+    rough = refine_roughly(cloud_m, starts, surface, config.icp.end_distance_diameters)
     unexplained_before = _measure_unexplained(cloud_m, starts, surface)
     unexplained_after = _measure_unexplained(cloud_m, rough, surface)
     is_better = unexplained_after < unexplained_before
@@ -376,13 +411,16 @@ def _refine_competitors(
         return []
 
     # Then exactly, a few steps for each.
-    short = replace(
-        config.icp,
+    batch = refine_exactly(
+        cloud_m,
+        improved[order],
+        surface,
         iterations=_STEPS,
-        cloud_points=min(_POINTS, config.icp.cloud_points),
-        start_distance_diameters=config.icp.end_distance_diameters,
+        start_diameters=config.icp.end_distance_diameters,
+        end_diameters=config.icp.end_distance_diameters,
+        max_points=min(_POINTS, config.icp.cloud_points),
+        sensor_offset_m=config.icp.sensor_offset_m,
     )
-    batch = refine_pose(cloud_m, improved[order], surface, short)
     competitors: list[_Competitor] = []
     for k, number in enumerate(order.tolist()):
         competitors.append(_Competitor(batch[k], unrefined[number]))
@@ -394,6 +432,5 @@ def _measure_unexplained(
 ) -> Float64[Tensor, " b"]:
     """Measure the share of a cloud that is far from each posed surface, by its nearest samples."""
     local_m = poses.inverse().apply(take_evenly(cloud_m, _SHARE_POINTS))
-    nearest_m = surface.points_m[surface.boxes.look_up(local_m)]
-    is_far = (local_m - nearest_m).norm(dim=-1) > NEAR * surface.diameter_m
+    is_far = surface.nearest(local_m, is_exact=False).distance_m > surface.near_m
     return is_far.double().mean(-1)

@@ -4,7 +4,7 @@ Another size is fitted as a seventh unknown of ICP, and the mirror image as a mo
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,13 +15,12 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import array_of, compiled, cross, dot, minus, vector
-from depthpose.pose.config import IcpConfig
 from depthpose.pose.geometry.surface import NEAR, Surface, Target, match
 from depthpose.pose.icp import (
     Residuals,
     build_normal_equations,
     make_rotation,
-    refine_pose,
+    refine_exactly,
     refine_roughly,
     tukey_weight,
 )
@@ -45,6 +44,7 @@ _STARTS = (1.0, 0.87, 1.15)
 _FIRST_START_BONUS = 0.03
 """Subtracted from the mean squared distance of the start at scale 1, in squared limits of nearness
 (``NEAR`` of the diameter)."""
+_MIRROR_STEPS = 30  # exact steps of ICP with the mirror image
 _MIRROR_PLANES = 24  # planes across which the posed model is mirrored, each for a start
 _CLEARLY_WORSE = 0.05
 """Where the mirror image, roughly fitted, is so much farther from the points than the model, exact
@@ -103,7 +103,7 @@ def measure_scale(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) 
         array_of(moved_m[0]),
         float(scale),
         array_of(surface.middle_m),
-        NEAR * surface.diameter_m,
+        surface.near_m,
         surface.target,
         True,
         np.full(moved_m.shape[1], -1),
@@ -148,7 +148,7 @@ def _fit_scale(
     """
     # The limit of a distance shrinks over half of the steps, then stays.
     factors = [1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS)]
-    limits_m = NEAR * surface.diameter_m * np.array(factors)
+    limits_m = surface.near_m * np.array(factors)
     moved = array_of(local_m).copy()
     scales = array_of(start_scales).copy()
     _grow(moved, scales, array_of(surface.middle_m), limits_m, surface.target, is_exact)
@@ -267,17 +267,17 @@ def measure_distance(
     """
     if times is not None:
         local_m = (local_m - surface.middle_m) / times[:, None, None] + surface.middle_m
-    index = surface.nearest(local_m) if is_exact else surface.boxes.look_up(local_m)
-    gap_m = (local_m - surface.points_m[index]).norm(dim=-1)
+    distance_m = surface.nearest(local_m, is_exact=is_exact).distance_m
     if times is not None:
-        gap_m = times[..., None] * gap_m
-    return (gap_m / (NEAR * surface.diameter_m)).clamp(max=1).square().mean(-1).sqrt()
+        distance_m = times[..., None] * distance_m
+    return (distance_m / surface.near_m).clamp(max=1).square().mean(-1).sqrt()
 
 
 def measure_mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
     """Measure how much nearer a cloud lies to the mirror image of the model, in its best pose.
 
-    The cloud is mirrored in place of the model, so that ICP finds a pose.
+    The cloud is mirrored in place of the model, so that ICP finds a pose. Its distances are those
+    of :func:`measure_scale`, not a user's: the gains that decide were measured with them.
 
     Returns:
         The gain in root mean square distance, in limits of nearness; negative where the mirror
@@ -293,8 +293,7 @@ def measure_mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Sur
     R = _FLIP[:, None] * pose.R.double() @ reflections
     middle_m = _FLIP * pose.double().apply(surface.middle_m[None])[0]
     starts = Rigid(R, middle_m - R @ surface.middle_m)
-    config = IcpConfig()
-    rough = refine_roughly(mirrored_m, starts, surface, config)
+    rough = refine_roughly(mirrored_m, starts, surface, NEAR)
 
     # Is the mirror image clearly worse?
     few_m = take_evenly(mirrored_m, _ROUGH_MIRROR_POINTS).expand(len(rough.R), -1, -1)
@@ -307,8 +306,14 @@ def measure_mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Sur
 
     # Exactly, from the best start alone: the best three had no other gain in 24 views.
     best = distance.argmin()[None]
-    config = replace(config, start_distance_diameters=config.end_distance_diameters)
-    refined = refine_pose(mirrored_m, rough[best], surface, config)
+    refined = refine_exactly(
+        mirrored_m,
+        rough[best],
+        surface,
+        iterations=_MIRROR_STEPS,
+        start_diameters=NEAR,
+        end_diameters=NEAR,
+    )
     exact_m = refined.camera_from_model.inverse().apply(mirrored_m[None])
     distance = measure_distance(exact_m, surface, is_exact=True)
     unmirrored = measure_distance(local_m, surface, is_exact=True)
@@ -373,7 +378,7 @@ def identify(
         scale=scale,
         mirror_gain=gain,
         size_tolerance=max_size_error + sensor_error,
-        mirror_tolerance=sides_m / (NEAR * surface.diameter_m),
+        mirror_tolerance=sides_m / surface.near_m,
         offset_error=_bound_offset_error(distance_m),
     )
 

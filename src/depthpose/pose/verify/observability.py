@@ -6,7 +6,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, cross_matrix
-from depthpose.pose.geometry.surface import NEAR, Surface
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.types import Axis, Symmetries
 
 _SAMPLED = 1000  # points of the cloud by which observability is measured
@@ -66,14 +66,13 @@ def observability(
     # The points that lie near the surface.
     points_m = take_evenly(cloud_m.double(), _SAMPLED)
     local_m = pose.inverse().apply(points_m)
-    index = surface.nearest(local_m)
-    distance_m = (local_m - surface.points_m[index]).norm(dim=-1)
-    is_near = distance_m < NEAR * surface.diameter_m
+    nearest = surface.nearest(local_m)
+    is_near = nearest.distance_m < surface.near_m
     if int(is_near.sum()) < 6:
         return None
 
     # Displacement of each point across the surface by each unknown.
-    normal = (surface.normals[index] @ pose.R.mT)[is_near]
+    normal = (surface.normals[nearest.sample] @ pose.R.mT)[is_near]
     middle_m = points_m.mean(0)
     radius_m = surface.diameter_m / 2
     arm_m = points_m[is_near] - middle_m

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
-from depthpose.pose.config import IcpConfig
-from depthpose.pose.geometry.surface import NEAR, Surface, prepare_surface
+from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.icp import refine_roughly
 from depthpose.pose.mesh import true_symmetries
 from depthpose.pose.propose.point_pairs import prepare_pairs, vote_poses
@@ -61,7 +60,7 @@ def find_partial_symmetries(model: ObjectModel) -> dict[str, Any]:
     # Refined as poses before a camera in the middle of the model, from where all is visible.
     points_m = surface.points_m - surface.middle_m
     starts = Rigid(candidates.R, candidates.t_m - surface.middle_m)
-    candidates = refine_roughly(points_m, starts, surface, IcpConfig())
+    candidates = refine_roughly(points_m, starts, surface)
     candidates = Rigid(candidates.R, candidates.t_m + surface.middle_m)
     candidates = candidates[_choose_partial_symmetries(candidates, surface).indices]
 
@@ -108,7 +107,7 @@ def _measure_shared_surface(motions: Rigid, surface: Surface) -> Float64[Tensor,
     """Measure the share of a surface that each motion moves onto the surface."""
     step = max(1, len(surface.points_m) // _SELF_COMPARED)
     local_m = motions.inverse().apply(surface.points_m[::step])
-    index = surface.boxes.look_up(local_m)
-    is_near = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
-    cosine = ((surface.normals[index] @ motions.R.mT) * surface.normals[::step]).sum(-1)
+    nearest = surface.nearest(local_m, is_exact=False)
+    is_near = nearest.distance_m < surface.near_m
+    cosine = ((surface.normals[nearest.sample] @ motions.R.mT) * surface.normals[::step]).sum(-1)
     return (is_near & (cosine.abs() > _MIN_COSINE)).double().mean(-1)
