@@ -148,34 +148,39 @@ class LightStereo(StereoNetwork):
             left_features, right, max_disparity_px // STEP_PX, first_px // STEP_PX
         )
 
-        # Disparity, confidence and sky at 1/4 size.
-        quarter_maps = [_expect_best(scores, first_px)]
+        # Disparity, confidence and sky at 1/4 size; the sky needs the confidence.
+        quarter_px = _expect_best(scores, first_px)
+        quarter_confidence = None
+        quarter_sky = None
         if with_confidence or self.sky_head is not None:
             near = partial(confidence_near, first_px=first_px)
             with torch.no_grad():
                 # By rows: probabilities between the scores are the largest volume.
-                confidence = by_rows(near, (scores, *quarter_maps), halo=0, rows=self.rows)
-            quarter_maps.append(confidence)
+                quarter_confidence = by_rows(near, (scores, quarter_px), halo=0, rows=self.rows)
         if self.sky_head is not None:
-            quarter_maps.append(self.sky_head(left_features.levels, *quarter_maps))
+            quarter_sky = self.sky_head(left_features.levels, quarter_px, quarter_confidence)
         coarse_px = _expect_all(scores, first_px) if self.training else None
         del scores  # the largest tensor that is still held
 
-        # All of them at full size, and the disparity refined there. The halos are what convolutions
-        # and neighbours reach: two rows at 1/4 size, and in the refinement five at 1/2 size.
-        quarters = torch.stack(quarter_maps, 1)
+        # All of them at full size. The halo is what neighbours reach: two rows at 1/4 size.
+        quarter_maps = (quarter_px, quarter_confidence, quarter_sky)
+        quarters = torch.stack([values for values in quarter_maps if values is not None], 1)
         inputs = (quarters, left_features.half, left_features.levels[0], right_half)
         enlarged = by_rows(self.enlargement, inputs, halo=2, rows=self.rows)
-        enlarged_px, *others = enlarged.unbind(1)
+        enlarged_px = enlarged[:, 0]
+        match_confidence = None if quarter_confidence is None else enlarged[:, 1]
+        sky = None if quarter_sky is None else enlarged[:, 2]
+
+        # The disparity refined. The halo is what convolutions reach: five rows at 1/2 size.
         refine = partial(self.refinement, least_px=first_px + MIN_DISPARITY_PX)
         half_rows = None if self.rows is None else 2 * self.rows
         inputs = (enlarged_px, left_features.half, right_half)
         refined_px = by_rows(refine, inputs, halo=5, rows=half_rows)
-
         heads = (refined_px,) if coarse_px is None else (coarse_px, enlarged_px, refined_px)
-        if self.sky_head is None:
-            return LightOutput(heads, others[0] if with_confidence else None, None)
-        match_confidence, sky = others
+
+        if sky is None:
+            return LightOutput(heads, match_confidence, None)
+        assert match_confidence is not None, "the sky needs it"
         if not self.training:
             # The sky wins only where it is surer than the match.
             sky = torch.where(sky > match_confidence, sky, sky.clamp(max=0.5))
