@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -252,8 +252,8 @@ def resize_image(
 
 def apply_to_maps(match: Match, function: Callable[[Tensor], Tensor]) -> Match:
     """Apply a function to each map of a match; maps that are None stay None."""
-    maps = {field.name: getattr(match, field.name) for field in fields(match)}
-    return Match(**{name: function(values) for name, values in maps.items() if values is not None})
+    maps = {name: values for name, values in vars(match).items() if isinstance(values, Tensor)}
+    return replace(match, **{name: function(values) for name, values in maps.items()})
 
 
 def resize_match(match: Match, height: int, width: int) -> Match:
@@ -266,7 +266,7 @@ def resize_match(match: Match, height: int, width: int) -> Match:
         is_sky = resize_map(is_sky.float(), height, width) > 0.5
     old_width = match.disparity_px.shape[1]
     disparity_px = resize_map(match.disparity_px, height, width) * (width / old_width)
-    return Match(disparity_px=disparity_px, confidence=confidence, is_sky=is_sky)
+    return replace(match, disparity_px=disparity_px, confidence=confidence, is_sky=is_sky)
 
 
 def resize_map(
@@ -282,7 +282,12 @@ def resize_map(
     return F.interpolate(values[None, None], (height, width), mode="bilinear")[0, 0]
 
 
-def estimate_from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:
+def join_warnings(*warnings: str) -> str:
+    """Join the warnings about an estimate to one text; empty ones are left out."""
+    return "; ".join(warning for warning in warnings if warning)
+
+
+def estimate_from_pair(pair: StereoInput, match: Match) -> DepthEstimate:
     """Make the estimate of a rectified pair from its match; metres where the camera has a baseline.
 
     Where the left image is blank (``find_blank_borders`` of ``depth/visible.py``), disparity and
@@ -292,7 +297,6 @@ def estimate_from_pair(pair: StereoInput, match: Match, warning: str = "") -> De
     Args:
         pair: the images, and their rig where it is known.
         match: the match, at the size of the images.
-        warning: why the estimate is doubtful; else empty.
     """
     disparity_px = match.disparity_px
     rig = pair.camera if isinstance(pair.camera, StereoRig) else None
@@ -327,7 +331,7 @@ def estimate_from_pair(pair: StereoInput, match: Match, warning: str = "") -> De
         disparity_px=disparity_px,
         confidence=confidence,
         is_sky=is_sky,
-        warning=warning,
+        warning=match.warning,
         input=pair,
     )
 
@@ -397,5 +401,6 @@ def estimate_from_virtual(
         confidence=confidence,
         right=resize_image(right, height, width),
         is_sky=is_sky,
+        warning=match.warning,
         input=image,
     )

@@ -14,9 +14,14 @@ from depthpose.core.devices import refused_memory
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import check_image
 from depthpose.depth.config import SelectionConfig
-from depthpose.depth.disparity import estimate_from_virtual, resize_image, size_at_focal_length
+from depthpose.depth.disparity import (
+    estimate_from_virtual,
+    join_warnings,
+    resize_image,
+    size_at_focal_length,
+)
 from depthpose.depth.mount import MountFilter, scale_by_mount
-from depthpose.depth.stereo import CameraMatcher, Matcher
+from depthpose.depth.stereo import Matcher, match_in_usual_range
 from depthpose.depth.synthesis import SynthesisedViews, Synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput, Views
 
@@ -95,7 +100,11 @@ def depth_before_mount(
                 warning = _check_in_distribution(
                     synthesiser, image.name, image_confidence, allow_ood
                 )
-                estimate = replace(estimate, image_confidence=image_confidence, warning=warning)
+                estimate = replace(
+                    estimate,
+                    image_confidence=image_confidence,
+                    warning=join_warnings(warning, estimate.warning),
+                )
             estimates.append(estimate)
     return estimates
 
@@ -156,10 +165,9 @@ def _match_views(
         ]
     assert matcher is not None, "FakestereoNet checked it"
     camera = camera_of(synthesiser.config.virtual_focal_px, (left.shape[3], left.shape[2]))
-    pairs = list(zip(left, views.right, strict=True))
-    if isinstance(matcher, CameraMatcher):
-        return matcher.match_many(pairs, camera)
-    return [matcher.match(*pair) for pair in pairs]
+    return [
+        match_in_usual_range(matcher, *pair, camera) for pair in zip(left, views.right, strict=True)
+    ]
 
 
 def _estimate_image_confidence(views: SynthesisedViews, index: int) -> float | None:
