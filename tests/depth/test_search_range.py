@@ -174,6 +174,35 @@ def test_what_lies_beyond_the_search_is_named_and_has_no_confidence() -> None:
     assert float((found.confidence[is_near] > 0.1).float().mean()) < 0.02
 
 
+@needs_weights
+@pytest.mark.parametrize("limit_px", [150.0, 100.0])
+def test_a_limit_within_the_search_counts(limit_px: float) -> None:
+    """The search holds more than what is asked for, or all of it: a strip of 180, a wall of 120."""
+    left, right, truth_px = planes(180, 120, width=640)
+    pair = StereoInput(name="planes", left=left, right=right, camera=rig(640))
+    free = FakestereoNet(matcher(), with_check=False).estimate_input(pair)
+    found = FakestereoNet(matcher(limit_px), with_check=False).estimate_input(pair)
+    assert free.warning == ""
+    assert f"disparities beyond {limit_px:.0f} px" in found.warning
+    assert found.confidence is not None
+    assert free.confidence is not None
+    is_beyond = found.disparity_px > limit_px
+    assert bool(is_beyond[truth_px > limit_px].float().mean() > 0.9)
+    assert not bool(found.confidence[is_beyond].any())
+    assert bool((free.confidence[is_beyond] > 0.5).any())
+
+
+@needs_weights
+@pytest.mark.parametrize("with_confidence", [True, False])
+def test_a_pair_is_warned_of_without_a_confidence_too(with_confidence: bool) -> None:
+    left, right, _ = planes(250, 16, width=640)
+    config = MatcherConfig(max_disparity_px=60.0, with_confidence=with_confidence)
+    net = FakestereoNet.load("default", config=config, use="pairs", with_check=False)
+    found = net.estimate_input(StereoInput(name="planes", left=left, right=right, camera=rig(640)))
+    assert (found.confidence is not None) == with_confidence
+    assert "disparities beyond 60 px" in found.warning
+
+
 def test_doubt_leaves_what_was_searched() -> None:
     confidence = torch.full((2, 4), 0.9)
     match = Match(disparity_px=torch.full((2, 4), 50.0), confidence=confidence)

@@ -328,7 +328,7 @@ class LightMatcher(NetworkMatcher):
         match = self.match_within(left, right, search, camera)
         if not self.config.with_left_right_check:
             match = doubt_hidden(match, measured)
-        return doubt_outside(match, measured, search)
+        return doubt_outside(match, measured, search, self.config.max_disparity_px)
 
     def run(self, left: View, right: View, search: SearchRange) -> Match:
         """Match a normalised pair whose sides suit the network."""

@@ -204,38 +204,51 @@ def doubt_hidden(match: Match, measured: DisparityRange) -> Match:
     return lower_where_disagreeing(match, measured.right_px, pixel_px, 2 * pixel_px)
 
 
-def doubt_outside(match: Match, measured: DisparityRange, search: SearchRange) -> Match:
-    """Doubt what lies beyond the search, and warn of it.
+def doubt_outside(
+    match: Match,
+    measured: DisparityRange,
+    search: SearchRange,
+    max_disparity_px: float | None = None,
+) -> Match:
+    """Doubt what lies beyond the search, or beyond a largest disparity, and warn of it.
 
-    The confidence becomes 0 where the narrow copy has a larger disparity than was searched, and
-    where the match is the last disparity of the search.
+    The confidence becomes 0 where the narrow copy has a larger disparity than was searched, where
+    the match is the last disparity of the search, and where it is larger than
+    ``max_disparity_px``.
 
     Args:
         match: the match of the pair.
         measured: the range of the disparities, with those of the narrow copy.
         search: the search of ``match``.
+        max_disparity_px: the largest disparity that counts, in pixels of the images; None: any.
 
     Returns:
         The match. Its ``warning`` is the share of pixels that surely lie beyond, unless that is
         small.
     """
-    if match.confidence is None:
-        return match
     end_px = search.end_in_images_px
-    may_be_beyond = measured.left_px > end_px - measured.step_px
-    if bool(may_be_beyond.any()):
-        # Neighbours within two pixels of the copy, its error, may lie beyond too.
-        may_be_beyond = _dilate(may_be_beyond, round(2 * measured.step_px / STEP_PX))
-    is_last = match.disparity_px > end_px - STEP_PX / search.scale
-    match = replace(match, confidence=match.confidence.masked_fill(may_be_beyond | is_last, 0.0))
+    limit_px = math.inf if max_disparity_px is None else max_disparity_px
+    is_beyond_limit = match.disparity_px > limit_px
+    if match.is_sky is not None:  # its disparity has no meaning
+        is_beyond_limit &= ~match.is_sky
 
-    is_beyond = (measured.left_px > end_px + measured.step_px) & measured.is_sure
+    if match.confidence is not None:
+        may_be_beyond = measured.left_px > end_px - measured.step_px
+        if bool(may_be_beyond.any()):
+            # Neighbours within two pixels of the copy, its error, may lie beyond too.
+            may_be_beyond = _dilate(may_be_beyond, round(2 * measured.step_px / STEP_PX))
+        is_last = match.disparity_px > end_px - STEP_PX / search.scale
+        is_doubtful = may_be_beyond | is_last | is_beyond_limit
+        match = replace(match, confidence=match.confidence.masked_fill(is_doubtful, 0.0))
+
+    is_beyond_search = measured.left_px > end_px + measured.step_px
+    is_beyond = (is_beyond_search | is_beyond_limit) & measured.is_sure
     share = float(is_beyond.float().mean())
     if share < _MIN_WARNED_SHARE:
         return match
-    largest_px = measured.left_px[is_beyond].max()
+    largest_px = torch.maximum(measured.left_px, match.disparity_px)[is_beyond].max()
     warning = (
-        f"{share:.1%} of the image have disparities beyond {end_px:.0f} px, the "
+        f"{share:.1%} of the image have disparities beyond {min(end_px, limit_px):.0f} px, the "
         f"limit of the search (up to {float(largest_px):.0f} px); they have no confidence. Give a "
         "larger --max-disparity (in Python MatcherConfig(max_disparity_px=...)), or none, and it "
         "is measured"
