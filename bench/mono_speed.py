@@ -34,7 +34,12 @@ from depthpose.depth.config import GeneratorConfig, MatcherConfig, Speed
 from depthpose.depth.disparity import resize_image, size_at_focal_length
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.generators import UNetGenerator
-from depthpose.depth.stereo import NetworkMatcher, PSMNet, PSMNetMatcher
+from depthpose.depth.stereo import (
+    NetworkMatcher,
+    PSMNet,
+    PSMNetMatcher,
+    match_in_usual_range,
+)
 from depthpose.depth.synthesis import make_synthesiser
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import MATCHERS
@@ -127,7 +132,7 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
     match_flops = 0
     matcher = net.matcher
     if matcher is not None and uses_matcher(net):
-        match_s = warm_seconds(lambda: matcher.match(left, right), device)
+        match_s = warm_seconds(lambda: match_in_usual_range(matcher, left, right), device)
         match_flops = matcher_flops(net, *size)
 
     share_of_peak = None

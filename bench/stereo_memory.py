@@ -57,7 +57,7 @@ def least_bytes(size: tuple[int, int], weights: Path | None) -> int:
     """Compute the least bound that is accepted."""
     config = network_for(weights).config
     height, width = (max(config.min_side_px, -(-side // 16) * 16) for side in size)
-    return psmnet_bytes(config, height, width, torch.float32)
+    return psmnet_bytes(config, config.max_disparity_px, height, width, torch.float32)
 
 
 def main() -> None:

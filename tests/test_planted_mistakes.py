@@ -25,7 +25,7 @@ from depthpose.core.files import write_depth_png
 from depthpose.core.files.images import check_image
 from depthpose.core.units import Unit
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.estimator import check_pair
+from depthpose.depth.estimator import check_rectified_pair
 from depthpose.depth.types import StereoInput
 from depthpose.depth.unit_mistakes import find_unit_mistake
 from depthpose.pose.cloud import prepare_cloud
@@ -77,7 +77,7 @@ def good_pair() -> tuple[torch.Tensor, torch.Tensor]:
 
 def look(left: torch.Tensor, right: torch.Tensor) -> None:
     given = StereoInput(name="pair", left=left, right=right, camera=None)
-    check_pair(given)
+    check_rectified_pair(given)
 
 
 @cache

@@ -5,6 +5,7 @@ from torch import Tensor
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.camera.pinhole import intrinsics
 from depthpose.depth.disparity import (
+    apply_to_maps,
     depth_from_disparity,
     depth_std_from_confidence,
     disparity_from_depth,
@@ -88,6 +89,14 @@ def test_resizing_to_its_own_size_changes_nothing() -> None:
     disparity_px = torch.rand(5, 9)
     same = resize_match(Match(disparity_px=disparity_px), 5, 9)
     assert torch.equal(same.disparity_px, disparity_px)
+
+
+def test_a_resized_or_cropped_match_keeps_its_warning() -> None:
+    match = Match(disparity_px=torch.rand(5, 9), warning="it rained")
+    assert resize_match(match, 10, 18).warning == "it rained"
+    cropped = apply_to_maps(match, lambda values: values[1:])
+    assert (cropped.disparity_px.shape, cropped.confidence) == ((4, 9), None)
+    assert cropped.warning == "it rained"
 
 
 def test_warping_by_zero_is_the_identity() -> None:

@@ -9,8 +9,8 @@ from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
-from depthpose.depth.stereo import CallableMatcher
-from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample
+from depthpose.depth.stereo import CallableMatcher, infinity_px
+from depthpose.depth.types import DepthEstimate, Match, StereoInput, StereoSample
 
 
 @pytest.fixture(scope="module")
@@ -189,6 +189,34 @@ def test_principal_points_farther_apart_than_the_images_are_refused(columns: int
     said = rf"cx_right_minus_left_px is {columns}, and the images are 240 px wide: the two views"
     with pytest.raises(InputError, match=said):
         net.estimate(image, apart_rig(columns), right=image)
+
+
+class SeesCamera:
+    """A matcher of the user's, which doubts what it answers."""
+
+    def match(
+        self,
+        left: torch.Tensor,
+        right: torch.Tensor,  # noqa: ARG002
+        camera: Camera | None = None,
+    ) -> Match:
+        assert left.shape == (3, 120, 240)
+        flat = torch.full(left.shape[1:], 6 + infinity_px(camera))
+        return Match(disparity_px=flat, warning="it rained")
+
+
+def test_a_matcher_is_given_the_camera_and_may_warn() -> None:
+    image = torch.rand(3, 120, 240)
+    net = FakestereoNet(SeesCamera(), with_check=False)
+    found = net.estimate(image, apart_rig(20), right=image)
+    assert float(found.disparity_px.median()) == -14
+    assert found.depth_m is not None
+    assert float(found.depth_m.median()) == pytest.approx(300 * 0.2 / 6)
+    assert found.warning == "it rained"
+    bare = torch.linspace(0, 1, 240).expand(3, 120, 240)
+    found = FakestereoNet(SeesCamera()).estimate(bare, right=bare.roll(2, 1) * 0.9)
+    assert "cannot tell whether the pair" in found.warning
+    assert found.warning.endswith("; it rained")
 
 
 @pytest.mark.parametrize("how", ["estimate", "estimate_input", "estimate_many"])

@@ -36,9 +36,9 @@ from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.evaluate import measure_image_confidence
 from depthpose.depth.generators import SelectionGenerator, UNetGenerator
-from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
+from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher, SearchRange
 from depthpose.depth.synthesis import make_synthesiser
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import (
     calibrate_weights,
     read_generator,
@@ -165,19 +165,19 @@ def test_one_file_serves_one_image_and_pairs(generator: UNetGenerator, tmp_path:
 def test_pairs_are_matched_at_the_focal_length_of_the_weights(
     generator: UNetGenerator, tmp_path: Path
 ) -> None:
-    sizes: list[tuple[int, int]] = []
+    sizes: list[tuple[int, ...]] = []
     path = tmp_path / "both.safetensors"
     write_depth_weights(path, generator=generator, matcher=small_matcher(50.0), facts={})
     net = FakestereoNet.load(path, with_check=False)
     assert net.matcher is not None
     assert isinstance(net.matcher, PSMNetMatcher)
-    work_size = net.matcher.work_size
+    match_padded = net.matcher._match_padded
 
-    def spy(seen: Camera) -> tuple[int, int]:
-        sizes.append(work_size(seen))
-        return sizes[-1]
+    def spy(left: torch.Tensor, right: torch.Tensor, search: SearchRange) -> Match:
+        sizes.append(tuple(left.shape[1:]))
+        return match_padded(left, right, search)
 
-    net.matcher.work_size = spy  # pyright: ignore[reportAttributeAccessIssue]
+    net.matcher._match_padded = spy
     image = torch.rand(3, 40, 60)
     net.estimate(image, camera(60, 40, 100.0, 0.2), right=image)
     net.estimate(image, camera(60, 40, 100.0))
@@ -733,23 +733,22 @@ def test_a_fine_match_is_the_same_network_at_a_larger_size_and_range() -> None:
     network = small_matcher(FOCAL_PX)
     left, right = torch.rand(2, 3, 80, 120)
     seen = camera(120, 80, 1.25 * FOCAL_PX)
-    found = speed_of(network, "fine").match_many([(left, right)], seen)[0]
+    found = speed_of(network, "fine").match(left, right, seen)
     farther = PSMNet(replace(network.config, max_disparity_px=32))
     farther.load_state_dict(network.state_dict())
     # 1.25 times 16 px of disparity takes a range of 32, a multiple of 16.
     expected = PSMNetMatcher(farther).match(left, right)
     assert torch.equal(found.disparity_px, expected.disparity_px)
-    quick = speed_of(network, "quick").match_many([(left, right)], seen)[0]
+    quick = speed_of(network, "quick").match(left, right, seen)
     assert not torch.equal(found.disparity_px, quick.disparity_px)
 
 
 def test_at_the_focal_length_of_training_there_is_one_speed() -> None:
     network = small_matcher(FOCAL_PX)
-    pairs = [(torch.rand(3, 40, 60), torch.rand(3, 40, 60)) for _ in range(2)]
+    left, right = torch.rand(2, 3, 40, 60)
     seen = camera(60, 40, FOCAL_PX)
-    quick, fine = (speed_of(network, s).match_many(pairs, seen) for s in ("quick", "fine"))
-    for one, other in zip(quick, fine, strict=True):
-        assert torch.equal(one.disparity_px, other.disparity_px)
+    quick, fine = (speed_of(network, s).match(left, right, seen) for s in ("quick", "fine"))
+    assert torch.equal(quick.disparity_px, fine.disparity_px)
 
 
 def test_a_focal_length_in_millimetres_is_refused() -> None:

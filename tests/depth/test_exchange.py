@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from depthpose.core.camera import StereoRig
+from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import MissingExtraError
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.types import Match, StereoInput
@@ -27,7 +27,12 @@ def pair() -> StereoInput:
 class KnowsDepth:
     """A matcher that answers ``DEPTH_M`` for every pair."""
 
-    def match(self, left: torch.Tensor, right: torch.Tensor) -> Match:  # noqa: ARG002
+    def match(
+        self,
+        left: torch.Tensor,  # noqa: ARG002
+        right: torch.Tensor,  # noqa: ARG002
+        camera: Camera | None = None,  # noqa: ARG002
+    ) -> Match:
         return Match(disparity_px=F * 0.5 / DEPTH_M)
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from depthpose.cli import main
-from depthpose.core.camera import StereoRig, write_camera
+from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.export import Case, Export, Graph, Limit
@@ -90,7 +90,12 @@ class FlatMatcher:
         self.config = config
         self.value_px = float(network.share.detach()) * network.config.most_px
 
-    def match(self, left: Tensor, right: Tensor) -> Match:  # noqa: ARG002
+    def match(
+        self,
+        left: Tensor,
+        right: Tensor,  # noqa: ARG002
+        camera: Camera | None = None,  # noqa: ARG002
+    ) -> Match:
         """Give every pixel one disparity."""
         return Match(disparity_px=torch.full(tuple(left.shape[-2:]), self.value_px))
 

@@ -38,7 +38,7 @@ def test_what_both_views_say_is_kept_and_the_rest_is_unknown() -> None:
 
 def test_an_unsure_matcher_labels_nothing() -> None:
     class Unsure:
-        def match(self, left: Tensor, right: Tensor):  # noqa: ANN202, ARG002
+        def match(self, left: Tensor, right: Tensor, camera: object = None):  # noqa: ANN202, ARG002
             from depthpose.depth.types import Match
 
             size = left.shape[1:]
@@ -56,7 +56,7 @@ def test_the_sky_is_no_label() -> None:
     """Its disparity agrees in both views and is sure; it is that of no thing."""
 
     class SeesSky:
-        def match(self, left: Tensor, right: Tensor):  # noqa: ANN202, ARG002
+        def match(self, left: Tensor, right: Tensor, camera: object = None):  # noqa: ANN202, ARG002
             from depthpose.depth.types import Match
 
             is_sky = torch.zeros(left.shape[1:], dtype=torch.bool)

@@ -61,9 +61,20 @@ def planes(near_px: int, far_px: int, width: int = 320, height: int = 96) -> tup
 
 
 def range_of(low_px: float, high_px: float, size: tuple[int, int] = (96, 320)) -> DisparityRange:
-    flat = Match(disparity_px=torch.full(size, high_px), confidence=torch.ones(size))
+    return range_from(torch.full(size, high_px), low_px, high_px)
+
+
+def range_from(
+    left_px: Tensor, low_px: float, high_px: float, right_px: Tensor | None = None
+) -> DisparityRange:
+    """A range that a copy of these disparities has, all of them sure."""
     return DisparityRange(
-        low_px=low_px, high_px=high_px, step_px=4.0, coarse=flat, right_px=flat.disparity_px
+        low_px=low_px,
+        high_px=high_px,
+        step_px=4.0,
+        left_px=left_px,
+        right_px=left_px if right_px is None else right_px,
+        is_sure=torch.ones_like(left_px, dtype=torch.bool),
     )
 
 
@@ -96,8 +107,7 @@ def test_black_borders_say_nothing_about_a_pair() -> None:
         view[..., -8:, :] = 0.0
     measured = measure_disparity_range(matcher(), left, right, 0.0)
     assert measured.high_px <= usual.high_px + measured.step_px
-    assert measured.coarse.confidence is not None
-    assert not bool(measured.coarse.confidence[:, :16].any())
+    assert not bool(measured.is_sure[:, :16].any())
 
 
 @needs_weights
@@ -125,9 +135,10 @@ def test_streets_are_searched_from_infinity_on(high_px: float) -> None:
     search = choose_search_range(matcher(), range_of(0.0, high_px), (375, 1242), camera)
     trained_px = matcher().network_config.max_disparity_px
     assert search.first_px == 0
-    assert trained_px <= search.span_px <= matcher().work_disparities(camera)
+    usual = matcher().usual_search((375, 1242), camera)
+    assert trained_px <= search.span_px <= usual.span_px
     assert search.end_in_images_px >= high_px
-    assert search.scale * 558 == pytest.approx(matcher().matching_focal_px(camera))
+    assert search.scale == usual.scale
 
 
 @needs_weights
@@ -163,19 +174,47 @@ def test_what_lies_beyond_the_search_is_named_and_has_no_confidence() -> None:
     assert float((found.confidence[is_near] > 0.1).float().mean()) < 0.02
 
 
+@needs_weights
+@pytest.mark.parametrize("limit_px", [150.0, 100.0])
+def test_a_limit_within_the_search_counts(limit_px: float) -> None:
+    """The search holds more than what is asked for, or all of it: a strip of 180, a wall of 120."""
+    left, right, truth_px = planes(180, 120, width=640)
+    pair = StereoInput(name="planes", left=left, right=right, camera=rig(640))
+    free = FakestereoNet(matcher(), with_check=False).estimate_input(pair)
+    found = FakestereoNet(matcher(limit_px), with_check=False).estimate_input(pair)
+    assert free.warning == ""
+    assert f"disparities beyond {limit_px:.0f} px" in found.warning
+    assert found.confidence is not None
+    assert free.confidence is not None
+    is_beyond = found.disparity_px > limit_px
+    assert bool(is_beyond[truth_px > limit_px].float().mean() > 0.9)
+    assert not bool(found.confidence[is_beyond].any())
+    assert bool((free.confidence[is_beyond] > 0.5).any())
+
+
+@needs_weights
+@pytest.mark.parametrize("with_confidence", [True, False])
+def test_a_pair_is_warned_of_without_a_confidence_too(with_confidence: bool) -> None:
+    left, right, _ = planes(250, 16, width=640)
+    config = MatcherConfig(max_disparity_px=60.0, with_confidence=with_confidence)
+    net = FakestereoNet.load("default", config=config, use="pairs", with_check=False)
+    found = net.estimate_input(StereoInput(name="planes", left=left, right=right, camera=rig(640)))
+    assert (found.confidence is not None) == with_confidence
+    assert "disparities beyond 60 px" in found.warning
+
+
 def test_doubt_leaves_what_was_searched() -> None:
     confidence = torch.full((2, 4), 0.9)
     match = Match(disparity_px=torch.full((2, 4), 50.0), confidence=confidence)
     coarse_px = torch.tensor([[0.0, 1, 2, 3], [0, 1, 2, 3]]) + 48
-    far = dataclasses.replace(match, disparity_px=coarse_px, confidence=confidence)
-    measured = DisparityRange(low_px=0.0, high_px=60.0, step_px=4.0, coarse=far, right_px=coarse_px)
+    measured = range_from(coarse_px, 0.0, 60.0)
     search = SearchRange(scale=1.0, first_px=0, span_px=128)
-    kept, said = doubt_outside(match, measured, search)
-    assert said == ""
+    kept = doubt_outside(match, measured, search)
+    assert kept.warning == ""
     assert kept.confidence is not None
     assert torch.equal(kept.confidence, confidence)
     at_end = dataclasses.replace(match, disparity_px=torch.full((2, 4), 126.0))
-    doubted, _ = doubt_outside(at_end, measured, search)
+    doubted = doubt_outside(at_end, measured, search)
     assert doubted.confidence is not None
     assert not bool(doubted.confidence.any()), "the last step may stand for all that is beyond"
 
@@ -188,9 +227,7 @@ def test_hidden_places_are_doubted_by_the_copy_of_the_right_view() -> None:
     confidence = torch.ones(4, 40)
     confidence[:, 39] = 0.9
     match = Match(disparity_px=left_px, confidence=confidence)
-    measured = DisparityRange(
-        low_px=0.0, high_px=20.0, step_px=4.0, coarse=match, right_px=right_px
-    )
+    measured = range_from(left_px, 0.0, 20.0, right_px)
     doubted = doubt_hidden(match, measured).confidence
     assert doubted is not None
     hidden = torch.zeros(40, dtype=torch.bool)

@@ -17,6 +17,7 @@ from depthpose.depth.config import MatcherConfig, PSMNetConfig, Speed
 from depthpose.depth.stereo import (
     PSMNet,
     PSMNetMatcher,
+    SearchRange,
     layers,
     normalise,
     psmnet,
@@ -131,7 +132,8 @@ def test_no_concatenation_volume_of_all_rows_is_made(monkeypatch: pytest.MonkeyP
         return concatenation_volume(left, right, bins)
 
     monkeypatch.setattr(psmnet, "concatenation_volume", noted)
-    matcher.match(*torch.rand(2, 3, 400, 32))
+    left, right = torch.rand(2, 3, 400, 32)
+    matcher.match(left, right)
     assert made == [36, 40, 40, 8], "32 rows of 100 at a time, and four on each side"
 
 
@@ -139,13 +141,12 @@ def test_more_disparities_than_in_training_equal_a_network_made_for_them() -> No
     network = random_network(SMALL)
     farther = PSMNet(replace(SMALL, max_disparity_px=48)).eval()
     farther.load_state_dict(network.state_dict())
-    left, right = torch.randn(2, 2, 3, 32, 64)
-    found = PSMNetMatcher(network).run(left, right, farther.config)
+    left, right = torch.randn(2, 3, 32, 64)
+    search = SearchRange(scale=1.0, first_px=0, span_px=48)
     with torch.no_grad():
-        expected_px = farther(left, right)[-1]
-    assert len(found) == 2
-    for match, expected in zip(found, expected_px, strict=True):
-        assert torch.allclose(match.disparity_px, expected, atol=1e-3)
+        found = PSMNetMatcher(network).run(left, right, search)
+        expected_px = farther(left[None], right[None])[-1][0]
+    assert torch.allclose(found.disparity_px, expected_px, atol=1e-3)
 
 
 @pytest.mark.skipif(not computes_bf16("cpu"), reason="this processor has no arithmetic for bf16")
@@ -162,7 +163,8 @@ def test_a_larger_size_is_searched_through_half_as_many_disparities_more_at_most
     )
     matcher = PSMNetMatcher(random_network(config), MatcherConfig(speed=speed))
     K = torch.tensor([[focal_px, 0, 100], [0, focal_px, 50], [0, 0, 1]], dtype=torch.float64)
-    assert matcher.work_disparities(Camera(width=200, height=100, K=K)) == disparities
+    camera = Camera(width=200, height=100, K=K)
+    assert matcher.usual_search((100, 200), camera).span_px == disparities
 
 
 @pytest.mark.skipif(not computes_bf16("cpu"), reason="this processor has no arithmetic for bf16")
@@ -237,10 +239,11 @@ def test_a_bound_is_met_or_refused_with_the_least_that_works(size: tuple[int, in
 
 def test_the_published_size_takes_less_than_1_gb_of_a_pair_of_kitti() -> None:
     network, size = PSMNetConfig(), (384, 1248)
-    whole = psmnet_bytes(network, *size, torch.float32)
+    span_px = network.max_disparity_px
+    whole = psmnet_bytes(network, span_px, *size, torch.float32)
     assert whole < 1_000_000_000
-    assert psmnet_bytes(network, *size, torch.bfloat16) < whole
-    assert psmnet_bytes(network, *size, torch.float32, rows=8) < whole
+    assert psmnet_bytes(network, span_px, *size, torch.bfloat16) < whole
+    assert psmnet_bytes(network, span_px, *size, torch.float32, rows=8) < whole
 
 
 def test_left_right_check_lowers_confidence_where_views_disagree() -> None:
@@ -286,14 +289,14 @@ _PSMNET = """
 from depthpose.depth.stereo import PSMNet, PSMNetMatcher as Matcher
 from depthpose.depth.stereo.psmnet import psmnet_bytes
 network = PSMNet().eval()
-least = psmnet_bytes(network.config, 256, 1024, torch.float32)
+least = psmnet_bytes(network.config, 192, 256, 1024, torch.float32)
 """
 _LIGHT = """
 from depthpose.depth.config import LightConfig
 from depthpose.depth.stereo import LightMatcher as Matcher, LightStereo
 from depthpose.depth.stereo.light import light_bytes
 network = LightStereo(LightConfig()).eval()
-least = light_bytes(network.config, 256, 1024, torch.float32)
+least = light_bytes(network.config, 192, 256, 1024, torch.float32)
 """
 
 
@@ -306,6 +309,7 @@ def test_peak_memory_of_a_bounded_run_stays_below_its_bound(network: str) -> Non
 import torch
 from pathlib import Path
 from depthpose.depth.config import MatcherConfig
+from depthpose.depth.stereo import match_in_usual_range
 {network}
 def kilobytes(field):
     lines = Path("/proc/self/status").read_text().splitlines()
@@ -313,10 +317,11 @@ def kilobytes(field):
 
 matcher = Matcher(network, MatcherConfig(max_memory_bytes=least))
 pair = torch.rand(2, 3, 256, 1024)
-matcher.match(*pair[..., :64, :128])  # loads the operators, which are no activations
+# Loads the operators, which are no activations.
+match_in_usual_range(matcher, *pair[..., :64, :128])
 before = kilobytes("VmRSS")
 Path("/proc/self/clear_refs").write_text("5")
-matcher.match(*pair)
+match_in_usual_range(matcher, *pair)
 print(least, 1024 * (kilobytes("VmHWM") - before))
 """
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)

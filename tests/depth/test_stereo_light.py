@@ -23,7 +23,13 @@ from depthpose.depth.config import (
     StreetsConfig,
 )
 from depthpose.depth.encoder import LiteEncoder, load_encoder
-from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, normalise
+from depthpose.depth.stereo import (
+    LightMatcher,
+    LightStereo,
+    PSMNet,
+    match_in_usual_range,
+    normalise,
+)
 from depthpose.depth.stereo.light import confidence_near, light_bytes
 from depthpose.depth.stereo.light_layers import (
     HALF_CHANNELS,
@@ -32,7 +38,6 @@ from depthpose.depth.stereo.light_layers import (
     correlation_volume,
     unit_groups,
 )
-from depthpose.depth.stereo.matcher import CameraMatcher
 from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
@@ -202,7 +207,7 @@ def test_what_the_refinement_corrects_learns_by_a_loss_of_its_own() -> None:
 def test_inference_equals_the_plain_network(size: tuple[int, int]) -> None:
     network = random_network()
     left, right = shifted_pair(*size, 5)
-    found = LightMatcher(network).match(left, right)
+    found = match_in_usual_range(LightMatcher(network), left, right)
     pair = [pad_top_right(normalise(view), network.config)[None] for view in (left, right)]
     with torch.no_grad():
         expected = network(*pair)[-1][0, -size[0] :, : size[1]]
@@ -232,26 +237,17 @@ def test_it_is_a_matcher_of_cameras() -> None:
     quick = make_matcher(network, MatcherConfig(speed="quick"))
     fine = make_matcher(network, MatcherConfig())
     assert isinstance(quick, LightMatcher)
-    assert isinstance(fine, CameraMatcher)
+    assert isinstance(fine, LightMatcher)
     assert quick.work_size(camera) == (32, 64)
     assert fine.work_size(camera) == (96, 192), "small images are enlarged 1.5 times"
     K = torch.tensor([[721.5, 0, 610], [0, 721.5, 173], [0, 0, 1]], dtype=torch.float64)
     height, width = fine.work_size(Camera(width=1242, height=375, K=K))
     assert 0.99 < height * width / 650_000 < 1.01, "KITTI's as far as the pixels go"
     for matcher in (quick, fine):
-        one, other = matcher.match_many([(left, right), (right, left)], camera)
+        one = matcher.match(left, right, camera)
+        other = matcher.match(right, left, camera)
         assert one.disparity_px.shape == (64, 128)
         assert not torch.equal(one.disparity_px, other.disparity_px)
-
-
-def test_batches_say_what_single_pairs_say() -> None:
-    matcher = LightMatcher(random_network())
-    pairs = [shifted_pair(40, 70, 5), shifted_pair(40, 70, 9)]
-    for one, alone in zip(
-        matcher.match_many(pairs), [matcher.match(*pair) for pair in pairs], strict=True
-    ):
-        difference = (one.disparity_px - alone.disparity_px).abs()
-        assert float((difference > 1e-2).float().mean()) < 0.01
 
 
 def test_some_rows_at_a_time_give_the_same_numbers() -> None:
@@ -272,10 +268,12 @@ def test_some_rows_at_a_time_give_the_same_numbers() -> None:
 def test_a_bound_on_memory_is_met_or_refused() -> None:
     left, right = shifted_pair(64, 96, 5)
     network = random_network()
-    least = light_bytes(SMALL, 64, 96, torch.float32)
-    LightMatcher(network, MatcherConfig(max_memory_bytes=least)).match(left, right)
+    least = light_bytes(SMALL, SMALL.max_disparity_px, 64, 96, torch.float32)
+    bound = LightMatcher(network, MatcherConfig(max_memory_bytes=least))
+    match_in_usual_range(bound, left, right)
+    tight = LightMatcher(network, MatcherConfig(max_memory_bytes=least - 1))
     with pytest.raises(InputError, match=f"too small for images of 64x96.*takes {least}"):
-        LightMatcher(network, MatcherConfig(max_memory_bytes=least - 1)).match(left, right)
+        match_in_usual_range(tight, left, right)
 
 
 def test_weights_come_back(tmp_path: Path) -> None:

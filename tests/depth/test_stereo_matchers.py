@@ -9,7 +9,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.depth.config import SGBMConfig
-from depthpose.depth.stereo import CallableMatcher, SGBMMatcher, check_pair, fill_holes
+from depthpose.depth.stereo import CallableMatcher, SGBMMatcher, check_views, fill_holes
 
 GOOD = torch.full((3, 8, 10), 0.5)
 NAN = float("nan")
@@ -37,7 +37,7 @@ NAN = float("nan")
 )
 def test_unusable_pairs_are_refused_with_a_remedy(left: object, right: object, text: str) -> None:
     with pytest.raises(InputError, match=text):
-        check_pair(left, right)
+        check_views(left, right)
 
 
 def test_function_of_the_users_is_a_matcher() -> None:

@@ -10,7 +10,7 @@ from tests.depth.short_encoder import short_encoder
 from tests.depth.test_stereo_light import SMALL, random_network, shifted_pair, training_batch
 from tests.synthetic_street import make_street
 
-from depthpose.core.camera import StereoRig
+from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.draw import draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.depth.augment import TrainingPair
@@ -21,7 +21,15 @@ from depthpose.depth.export import make_export
 from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss
 from depthpose.depth.predictions import read_estimate, write_estimate
-from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, light, normalise
+from depthpose.depth.stereo import (
+    LightMatcher,
+    LightStereo,
+    StereoNetwork,
+    light,
+    match_from_infinity,
+    match_in_usual_range,
+    normalise,
+)
 from depthpose.depth.stereo.network_matcher import lower_where_disagreeing
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
@@ -51,7 +59,10 @@ def partly_sky(config: LightConfig = SMALL) -> LightStereo:
 class UpperHalf:
     """A matcher that finds 4 px everywhere and the sky in the upper half of a view."""
 
-    def match(self, left: torch.Tensor, right: torch.Tensor) -> Match:  # noqa: ARG002
+    def match(self, left: torch.Tensor, right: torch.Tensor, camera: Camera | None = None) -> Match:
+        return match_from_infinity(self.match_from_zero, left, right, camera)
+
+    def match_from_zero(self, left: torch.Tensor, right: torch.Tensor) -> Match:  # noqa: ARG002
         is_sky = torch.zeros(left.shape[1:], dtype=torch.bool)
         is_sky[: left.shape[1] // 2] = True
         disparity_px = torch.full(left.shape[1:], 4.0)
@@ -124,18 +135,19 @@ def test_the_sky_is_learnt_as_a_class_and_not_as_a_disparity() -> None:
 def test_the_match_says_where_the_sky_is() -> None:
     network = partly_sky()
     left, right = shifted_pair(40, 70, 5)
-    found = LightMatcher(network).match(left, right)
+    found = match_in_usual_range(LightMatcher(network), left, right)
     assert found.is_sky is not None
     assert found.is_sky.shape == (40, 70)
     assert 0.05 < float(found.is_sky.float().mean()) < 0.95
     assert found.confidence is not None
     assert float(found.confidence[found.is_sky].min()) > 0.5, "its probability"
-    unsure = LightMatcher(network, MatcherConfig(with_confidence=False)).match(left, right)
+    plain = LightMatcher(network, MatcherConfig(with_confidence=False))
+    unsure = match_in_usual_range(plain, left, right)
     assert unsure.is_sky is not None
     assert unsure.confidence is None
     assert float((unsure.is_sky != found.is_sky).float().mean()) < 0.001
     checked = MatcherConfig(with_left_right_check=True)
-    other = LightMatcher(network, checked).match(left, right)
+    other = match_in_usual_range(LightMatcher(network, checked), left, right)
     assert other.is_sky is not None
     assert other.is_sky.shape == (40, 70)
     assert bool(other.is_sky.any())

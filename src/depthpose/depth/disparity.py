@@ -1,7 +1,7 @@
 """Disparity to depth and back, and maps and matches that are warped or resized."""
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -160,8 +160,8 @@ def resize_image(
 
 def apply_to_maps(match: Match, function: Callable[[Tensor], Tensor]) -> Match:
     """Apply a function to each map of a match; maps that are None stay None."""
-    maps = {field.name: getattr(match, field.name) for field in fields(match)}
-    return Match(**{name: function(values) for name, values in maps.items() if values is not None})
+    maps = {name: values for name, values in vars(match).items() if isinstance(values, Tensor)}
+    return replace(match, **{name: function(values) for name, values in maps.items()})
 
 
 def resize_match(match: Match, height: int, width: int) -> Match:
@@ -174,7 +174,7 @@ def resize_match(match: Match, height: int, width: int) -> Match:
         is_sky = resize_map(is_sky.float(), height, width) > 0.5
     old_width = match.disparity_px.shape[1]
     disparity_px = resize_map(match.disparity_px, height, width) * (width / old_width)
-    return Match(disparity_px=disparity_px, confidence=confidence, is_sky=is_sky)
+    return replace(match, disparity_px=disparity_px, confidence=confidence, is_sky=is_sky)
 
 
 def resize_map(

@@ -16,9 +16,10 @@ from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.generators import SelectionGenerator
 from depthpose.depth.graphs import image_graph, pair_graph
-from depthpose.depth.stereo import LightStereo, NetworkMatcher, StereoNetwork
+from depthpose.depth.stereo import LightStereo, Matcher, StereoNetwork, match_in_usual_range
 from depthpose.depth.synthesis import make_synthesiser
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.triangulation import estimate_from_pair
+from depthpose.depth.types import DepthEstimate, StereoInput, View
 from depthpose.depth.weights import DepthWeights, make_matcher
 
 _LIMITS = {
@@ -110,9 +111,6 @@ def _make_pair_cases(weights: DepthWeights) -> Iterator[Case]:
     """Make cases of synthetic pairs of several sizes, with PyTorch's estimates."""
     assert weights.matcher is not None
     matcher = make_matcher(weights.matcher, _QUICK)
-    if isinstance(matcher, NetworkMatcher):
-        matcher.finds_range = False  # as in a graph
-    net = FakestereoNet(matcher, with_check=False)
     outputs = ["disparity_px", "confidence"]
     has_sky = getattr(weights.matcher.config, "with_sky", False)
     if has_sky:
@@ -126,12 +124,17 @@ def _make_pair_cases(weights: DepthWeights) -> Iterator[Case]:
         if work_focal_px is not None:
             rig = StereoRig(width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5)
             inputs["K"] = camera.K.numpy()
-        pairs = (
-            StereoInput(name="case", left=left_view, right=right_view, camera=rig)
-            for left_view, right_view in zip(left, right, strict=True)
-        )
-        estimates = [net.estimate_input(pair) for pair in pairs]
+        pairs = zip(left, right, strict=True)
+        estimates = [_estimate_as_graph(matcher, *pair, rig) for pair in pairs]
         yield _make_case(inputs, estimates, outputs)
+
+
+def _estimate_as_graph(
+    matcher: Matcher, left: View, right: View, rig: StereoRig | None
+) -> DepthEstimate:
+    """Estimate depth of a pair as a graph does, which does not measure its disparities."""
+    pair = StereoInput(name="case", left=left, right=right, camera=rig)
+    return estimate_from_pair(pair, match_in_usual_range(matcher, left, right, rig))
 
 
 def _make_image_cases(weights: DepthWeights) -> Iterator[Case]:

@@ -16,7 +16,7 @@ from depthpose.core.run_folder import claim_folder, claim_names, is_whole, note_
 from depthpose.depth.config import Settings
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import warp_right_to_left
-from depthpose.depth.estimator import FakestereoNet, check_pair
+from depthpose.depth.estimator import FakestereoNet, check_rectified_pair
 from depthpose.depth.types import Map, StereoInput
 
 
@@ -87,7 +87,7 @@ def label_pairs(
             continue
         try:
             pair = dataset.read_input(index)
-            check_pair(pair)
+            check_rectified_pair(pair)
             labelled_px = label_pair(net, pair, config)
         except InputError as error:
             _keep_or_raise(error, failures)

@@ -20,7 +20,12 @@ _MIN_SKY_SHARE = 0.002
 the match: 43 of them in a garage made an RMSE of 0.87 m, in place of 0.25 m."""
 
 
-def estimate_from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:
+def join_warnings(*warnings: str) -> str:
+    """Join the warnings about an estimate to one text; empty ones are left out."""
+    return "; ".join(warning for warning in warnings if warning)
+
+
+def estimate_from_pair(pair: StereoInput, match: Match) -> DepthEstimate:
     """Make the estimate of a rectified pair from its match; metres where the camera has a baseline.
 
     The confidence is 0 where either view is blank (``find_blank_borders`` of ``depth/visible.py``),
@@ -29,7 +34,6 @@ def estimate_from_pair(pair: StereoInput, match: Match, warning: str = "") -> De
     Args:
         pair: the images, and their rig where it is known.
         match: the match, at the size of the images.
-        warning: why the estimate is doubtful; else empty.
     """
     match = _without_false_sky(match, pair.left)
     if match.confidence is not None and pair.right is not None:
@@ -38,7 +42,7 @@ def estimate_from_pair(pair: StereoInput, match: Match, warning: str = "") -> De
         confidence = (match.confidence * texture).masked_fill(right_is_blank, 0.0)
         match = replace(match, confidence=confidence)
     rig = pair.camera if isinstance(pair.camera, StereoRig) else None
-    return replace(triangulate(match, pair, rig), warning=warning)
+    return triangulate(match, pair, rig)
 
 
 def estimate_from_virtual(
@@ -109,6 +113,7 @@ def triangulate(match: Match, depth_input: StereoInput, rig: StereoRig | None) -
         disparity_px=disparity_px,
         confidence=confidence,
         is_sky=match.is_sky,
+        warning=match.warning,
     )
 
 

@@ -79,6 +79,7 @@ class Match:
     #: left pixels that show the sky, whose disparity has no meaning; None where the matcher does
     #: not recognise the sky
     is_sky: Mask | None = None
+    warning: str = ""  #: why the match is doubtful as a whole; else empty
 
 
 @dataclass(frozen=True, kw_only=True)

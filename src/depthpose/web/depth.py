@@ -14,7 +14,7 @@ from depthpose.core.files import image_size, read_exif_focal, read_image, write_
 from depthpose.depth.config import COLOR_RANGE_M, StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import OutputOptions, write_estimate
-from depthpose.depth.stereo import CameraMatcher
+from depthpose.depth.stereo import NetworkMatcher
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.depth import list_depth_facts, make_depth_scene
@@ -117,7 +117,7 @@ def _refuse_large_inputs(pair: StereoInput, net: FakestereoNet) -> None:
         virtual_size = (virtual_width, virtual_height)
         camera = camera_of(config.virtual_focal_px, virtual_size) or camera
         is_matched = config.answer != "own"  # else depth is the generator's, without a matcher
-    if is_matched and isinstance(net.matcher, CameraMatcher):
+    if is_matched and isinstance(net.matcher, NetworkMatcher):
         sizes.append(net.matcher.work_size(camera))
     elif is_matched:
         sizes.append((camera.height, camera.width))

@@ -2,6 +2,6 @@
 
 from depthpose.depth.estimator.net import AnyPicture as AnyPicture
 from depthpose.depth.estimator.net import FakestereoNet as FakestereoNet
-from depthpose.depth.estimator.pair import check_pair as check_pair
+from depthpose.depth.estimator.pair import check_rectified_pair as check_rectified_pair
 from depthpose.depth.estimator.pictures import DepthPipeline as DepthPipeline
 from depthpose.depth.estimator.pictures import pipeline as pipeline

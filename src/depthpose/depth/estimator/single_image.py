@@ -16,9 +16,9 @@ from depthpose.core.errors import InputError
 from depthpose.core.files.images import check_image
 from depthpose.depth.config import SelectionConfig
 from depthpose.depth.disparity import resize_image, resize_match, size_at_focal_length
-from depthpose.depth.stereo import CameraMatcher, Matcher
+from depthpose.depth.stereo import Matcher, match_in_usual_range
 from depthpose.depth.synthesis import SynthesisedViews, Synthesiser
-from depthpose.depth.triangulation import estimate_from_virtual
+from depthpose.depth.triangulation import estimate_from_virtual, join_warnings
 from depthpose.depth.types import DepthEstimate, Match, StereoInput, Views
 
 
@@ -85,7 +85,11 @@ def _estimate_one_size(
         image_confidence = _estimate_image_confidence(views, index)
         if image_confidence is not None:
             warning = _check_in_distribution(synthesiser, image.name, image_confidence, allow_ood)
-            estimate = replace(estimate, image_confidence=image_confidence, warning=warning)
+            estimate = replace(
+                estimate,
+                image_confidence=image_confidence,
+                warning=join_warnings(warning, estimate.warning),
+            )
         estimates.append(estimate)
     return estimates
 
@@ -146,10 +150,9 @@ def _match_views(
         ]
     assert matcher is not None, "FakestereoNet checked it"
     camera = camera_of(synthesiser.config.virtual_focal_px, (left.shape[3], left.shape[2]))
-    pairs = list(zip(left, views.right, strict=True))
-    if isinstance(matcher, CameraMatcher):
-        return matcher.match_many(pairs, camera)
-    return [matcher.match(*pair) for pair in pairs]
+    return [
+        match_in_usual_range(matcher, *pair, camera) for pair in zip(left, views.right, strict=True)
+    ]
 
 
 def _estimate_image_confidence(views: SynthesisedViews, index: int) -> float | None:

@@ -4,6 +4,7 @@ Its layers are in ``light_layers``. Disparity is the mean over the few best disp
 Bangunharcana et al., IROS 2021), enlarged and refined by features of both views.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
 from depthpose.depth.disparity import MIN_DISPARITY_PX
@@ -28,8 +30,20 @@ from depthpose.depth.stereo.light_layers import (
     SkyHead,
     ViewFeatures,
 )
-from depthpose.depth.stereo.network_matcher import STEP_PX, NetworkMatcher, StereoNetwork
-from depthpose.depth.types import Maps, Match, Views
+from depthpose.depth.stereo.matcher import check_views, infinity_px
+from depthpose.depth.stereo.network_matcher import (
+    STEP_PX,
+    NetworkMatcher,
+    SearchRange,
+    StereoNetwork,
+)
+from depthpose.depth.stereo.search_range import (
+    choose_search_range,
+    doubt_hidden,
+    doubt_outside,
+    measure_disparity_range,
+)
+from depthpose.depth.types import Maps, Match, View, Views
 
 _CANDIDATES = 2
 """Number of the highest scores over whose disparities the expectation is taken."""
@@ -119,7 +133,7 @@ class LightStereo(StereoNetwork):
         self,
         left: Views,
         right: Views,
-        max_disparity_px: int,
+        span_px: int,
         *,
         first_px: int = 0,
         with_confidence: bool = False,
@@ -129,7 +143,7 @@ class LightStereo(StereoNetwork):
         Args:
             left: normalised left views.
             right: normalised right views.
-            max_disparity_px: number of disparities that are searched.
+            span_px: number of disparities that are searched.
             first_px: the least of them, a multiple of 4; negative where rigs have principal points
                 apart.
             with_confidence: estimate the confidence too.
@@ -145,37 +159,42 @@ class LightStereo(StereoNetwork):
             )
         left_features = self.features(left)
         scores, right_half = self._score_disparities(
-            left_features, right, max_disparity_px // STEP_PX, first_px // STEP_PX
+            left_features, right, span_px // STEP_PX, first_px // STEP_PX
         )
 
-        # Disparity, confidence and sky at 1/4 size.
-        quarter_maps = [_expect_best(scores, first_px)]
+        # Disparity, confidence and sky at 1/4 size; the sky needs the confidence.
+        quarter_px = _expect_best(scores, first_px)
+        quarter_confidence = None
+        quarter_sky = None
         if with_confidence or self.sky_head is not None:
             near = partial(confidence_near, first_px=first_px)
             with torch.no_grad():
                 # By rows: probabilities between the scores are the largest volume.
-                confidence = by_rows(near, (scores, *quarter_maps), halo=0, rows=self.rows)
-            quarter_maps.append(confidence)
+                quarter_confidence = by_rows(near, (scores, quarter_px), halo=0, rows=self.rows)
         if self.sky_head is not None:
-            quarter_maps.append(self.sky_head(left_features.levels, *quarter_maps))
+            quarter_sky = self.sky_head(left_features.levels, quarter_px, quarter_confidence)
         coarse_px = _expect_all(scores, first_px) if self.training else None
         del scores  # the largest tensor that is still held
 
-        # All of them at full size, and the disparity refined there. The halos are what convolutions
-        # and neighbours reach: two rows at 1/4 size, and in the refinement five at 1/2 size.
-        quarters = torch.stack(quarter_maps, 1)
+        # All of them at full size. The halo is what neighbours reach: two rows at 1/4 size.
+        quarter_maps = (quarter_px, quarter_confidence, quarter_sky)
+        quarters = torch.stack([values for values in quarter_maps if values is not None], 1)
         inputs = (quarters, left_features.half, left_features.levels[0], right_half)
         enlarged = by_rows(self.enlargement, inputs, halo=2, rows=self.rows)
-        enlarged_px, *others = enlarged.unbind(1)
+        enlarged_px = enlarged[:, 0]
+        match_confidence = None if quarter_confidence is None else enlarged[:, 1]
+        sky = None if quarter_sky is None else enlarged[:, 2]
+
+        # The disparity refined. The halo is what convolutions reach: five rows at 1/2 size.
         refine = partial(self.refinement, least_px=first_px + MIN_DISPARITY_PX)
         half_rows = None if self.rows is None else 2 * self.rows
         inputs = (enlarged_px, left_features.half, right_half)
         refined_px = by_rows(refine, inputs, halo=5, rows=half_rows)
-
         heads = (refined_px,) if coarse_px is None else (coarse_px, enlarged_px, refined_px)
-        if self.sky_head is None:
-            return LightOutput(heads, others[0] if with_confidence else None, None)
-        match_confidence, sky = others
+
+        if sky is None:
+            return LightOutput(heads, match_confidence, None)
+        assert match_confidence is not None, "the sky needs it"
         if not self.training:
             # The sky wins only where it is surer than the match.
             sky = torch.where(sky > match_confidence, sky, sky.clamp(max=0.5))
@@ -235,11 +254,17 @@ ROWS = 16
 
 
 def light_bytes(
-    config: LightConfig, height: int, width: int, dtype: torch.dtype, rows: int = ROWS
+    config: LightConfig,
+    span_px: int,
+    height: int,
+    width: int,
+    dtype: torch.dtype,
+    rows: int = ROWS,
 ) -> int:
     """Estimate the peak memory of matching a padded pair [bytes], with margin for the allocator.
 
-    One volume of the largest size is held whole; ``rows`` at quarter size are computed at a time.
+    One volume of ``span_px`` disparities is held whole; ``rows`` at quarter size are computed at a
+    time.
     """
     float_bytes = 4
     quarter_pixels = height * width // 16
@@ -252,7 +277,7 @@ def light_bytes(
     image_bytes = 2 * 3 * 3 * float_bytes * height * width
     # A volume at quarter size, the smaller ones, and three of the rows at a time.
     widest = max(config.groups, config.volume_widths[0])
-    volume_pixel_bytes = widest * (config.max_disparity_px // STEP_PX) * dtype.itemsize
+    volume_pixel_bytes = widest * (span_px // STEP_PX) * dtype.itemsize
     volume_bytes = volume_pixel_bytes * (7 * quarter_pixels // 4 + 3 * slab_pixels)
     # Weights that enlarge maps, thrice, and what they are made of at half size: joined features,
     # and nine comparisons in float32. The refinement takes less.
@@ -266,13 +291,15 @@ def light_bytes(
 
 
 class LightMatcher(NetworkMatcher):
-    """The light network with pre- and post-processing, as :class:`NetworkMatcher` says."""
+    """The light network with pre- and post-processing, as :class:`NetworkMatcher` says.
+
+    It measures where the disparities of a pair lie, and searches there.
+    """
 
     fine_pixels = 650_000
     """Pixels of a fine match at most: an image of KITTI, enlarged 1.18 times."""
     largest_upscale = 1.5
     largest_span_factor = 1.75
-    finds_range = True
     activation_bytes = staticmethod(light_bytes)
 
     def fold(self, network: LightStereo, example: Tensor) -> LightStereo:
@@ -281,23 +308,51 @@ class LightMatcher(NetworkMatcher):
         network.rows = ROWS if self.device.type == "cpu" else None
         return layers.fold(network, example)
 
-    def run(
-        self, left: Views, right: Views, network_config: LightConfig, first_px: int = 0
-    ) -> list[Match]:
-        """Match normalised pairs whose sides suit the network."""
+    @torch.no_grad()
+    def match(self, left: Tensor, right: Tensor, camera: Camera | None = None) -> Match:
+        """Match one pair of any size within the range of its disparities, which is measured.
+
+        The match has a ``warning`` where disparities lie beyond what was searched.
+
+        Args:
+            left: left image, ``(3, H, W)`` RGB in [0, 1].
+            right: right image, the same size.
+            camera: camera of the left image; None: it is not known.
+
+        Raises:
+            InputError: as :meth:`NetworkMatcher.match`.
+        """
+        check_views(left, right)
+        measured = measure_disparity_range(self, left, right, infinity_px(camera))
+        search = choose_search_range(self, measured, left.shape[1:], camera)
+        match = self.match_within(left, right, search, camera)
+        if not self.config.with_left_right_check:
+            match = doubt_hidden(match, measured)
+        return doubt_outside(match, measured, search, self.config.max_disparity_px)
+
+    def run(self, left: View, right: View, search: SearchRange) -> Match:
+        """Match a normalised pair whose sides suit the network."""
         output = self._network.match_views(
-            left.to(self.dtype),
-            right.to(self.dtype),
-            network_config.max_disparity_px,
-            first_px=first_px,
+            left[None].to(self.dtype),
+            right[None].to(self.dtype),
+            search.span_px,
+            first_px=search.first_px,
             with_confidence=self.config.with_confidence,
         )
-        is_sky = None if output.sky is None else output.sky > 0.5
-        return [
-            Match(
-                disparity_px=disparity_px,
-                confidence=None if output.confidence is None else output.confidence[index],
-                is_sky=None if is_sky is None else is_sky[index],
-            )
-            for index, disparity_px in enumerate(output.heads[-1])
-        ]
+        return Match(
+            disparity_px=output.heads[-1][0],
+            confidence=None if output.confidence is None else output.confidence[0],
+            is_sky=None if output.sky is None else output.sky[0] > 0.5,
+        )
+
+    def usual_search(self, size: Sequence[int], camera: Camera | None) -> SearchRange:
+        """Compute the search of a camera's pairs, as :meth:`NetworkMatcher.usual_search`.
+
+        Without a camera, a fine match has ``fine_pixels``, and searches the most disparities.
+        """
+        trained = self.network_config
+        is_as_given = self.config.speed == "quick" or trained.work_focal_px is None
+        if camera is not None or is_as_given:
+            return super().usual_search(size, camera)
+        span_px = self.whole_steps(trained.max_disparity_px * self.largest_span_factor)
+        return SearchRange(scale=self.fine_scale(size), first_px=0, span_px=span_px)

@@ -1,38 +1,43 @@
-"""Matchers without weights: a function of the user's, and OpenCV's StereoSGBM.
+"""What every matcher has, and matchers without weights: a function, and OpenCV's StereoSGBM.
 
-:class:`Matcher` and :class:`CameraMatcher` say what every matcher has.
+These begin at a disparity of 0, so views are moved until that is infinitely far away.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from depthpose.core.camera import Camera
+from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError, import_opencv
 from depthpose.core.files.images import check_image
 from depthpose.depth.config import SGBMConfig
+from depthpose.depth.disparity import apply_to_maps
 from depthpose.depth.types import Map, Match, View
 
 _SLACK = 1e-3  # by which rounding may put a value of an image beyond [0, 1]
 
 
-@runtime_checkable
 class Matcher(Protocol):
-    """Anything that estimates the disparity of the left image of a rectified pair.
+    """Anything that estimates the disparity of the left image of a rectified pair."""
 
-    One that is a :class:`CameraMatcher` too is given several pairs at once, with their camera.
-    """
-
-    def match(self, left: Tensor, right: Tensor) -> Match:
+    def match(self, left: Tensor, right: Tensor, camera: Camera | None = None) -> Match:
         """Match one pair.
 
         Args:
             left: left image, ``(3, H, W)`` RGB in [0, 1], float32.
             right: right image, the same size.
+            camera: camera of the left image, where it is known. What is infinitely far away has the
+                disparity :func:`infinity_px`, which may be negative; :func:`match_from_infinity`
+                serves matchers that begin at 0.
+
+        Returns:
+            The match, at the size of the images and in their pixels.
 
         Raises:
             InputError: the images are no such pair, or this matcher cannot take them.
@@ -40,27 +45,90 @@ class Matcher(Protocol):
         ...
 
 
-@runtime_checkable
-class CameraMatcher(Matcher, Protocol):
-    """A matcher that chooses the size at which pairs are matched, and takes several at once."""
+def infinity_px(camera: Camera | None) -> float:
+    """Return the disparity of what is infinitely far away [px]; 0 where no rig is known.
 
-    def match_many(
-        self, pairs: Sequence[tuple[Tensor, Tensor]], camera: Camera | None = None
-    ) -> list[Match]:
-        """Match pairs of one camera.
+    It is negative where the principal point of the right camera lies farther to the right.
 
-        Args:
-            pairs: left and right images, as for ``match``.
-            camera: camera of the left images; None: it is not known.
+    Raises:
+        InputError: the views share nothing that is far away.
+    """
+    if not isinstance(camera, StereoRig):
+        return 0.0
+    cx_difference_px = camera.cx_right_minus_left_px
+    if abs(math.ceil(cx_difference_px)) >= camera.width:
+        raise InputError(
+            f"cx_right_minus_left_px is {cx_difference_px:g}, and the images are {camera.width} px "
+            "wide: the two views share nothing that is far away. Take both principal points "
+            "from one calibration of images of this size."
+        )
+    return -cx_difference_px
 
-        Raises:
-            InputError: as for ``match``.
-        """
-        ...
 
-    def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Compute the rows and columns at which the images of a camera are matched [px]."""
-        ...
+def match_from_infinity(
+    match: Callable[[Tensor, Tensor], Match], left: Tensor, right: Tensor, camera: Camera | None
+) -> Match:
+    """Match a pair by a function that knows no negative disparities.
+
+    Views are moved so that a disparity of 0 is infinitely far away, and their match moved back.
+
+    Args:
+        match: from the moved left and right view to their match.
+        left: left image, ``(3, H, W)`` RGB in [0, 1].
+        right: right image, the same size.
+        camera: camera of the left image, where it is known.
+
+    Returns:
+        The match, in pixels of the images.
+
+    Raises:
+        InputError: the images are no pair, or share nothing that is far away.
+    """
+    check_views(left, right)
+    shift_px = math.floor(infinity_px(camera))
+    moved_left, moved_right = move_views(left, right, shift_px)
+    return move_match_back(match(moved_left, moved_right), shift_px)
+
+
+def move_views(left: Tensor, right: Tensor, first_px: int) -> tuple[Tensor, Tensor]:
+    """Move the views of a pair so that a disparity of ``first_px`` becomes 0.
+
+    The disparity of a point is its column in the left view less that in the right one. So the right
+    view moves to the right by ``first_px`` columns, or, where that is negative, the left view by
+    ``-first_px`` columns. Columns that become free repeat the border.
+
+    Args:
+        left: ``(3, H, W)``.
+        right: the same size.
+        first_px: in whole pixels, of either sign.
+
+    Returns:
+        The left and the right view, both ``(3, H, W)``; where ``first_px`` is negative both are
+        ``-first_px`` columns wider, so that nothing is cut off.
+    """
+    if first_px >= 0:
+        # The columns that are cut off match nothing at a disparity of first_px or more.
+        shifted_right = F.pad(right[None], (first_px, 0, 0, 0), mode="replicate")[0]
+        return left, shifted_right[..., : left.shape[2]]
+    # The right view stays in place, and is padded on the right to the width of the left view.
+    added = -first_px
+    shifted_left = F.pad(left[None], (added, 0, 0, 0), mode="replicate")[0]
+    padded_right = F.pad(right[None], (0, added, 0, 0), mode="replicate")[0]
+    return shifted_left, padded_right
+
+
+def move_match_back(match: Match, first_px: int) -> Match:
+    """Convert a match of moved views to the pixels of the views before :func:`move_views`."""
+    if first_px == 0:
+        return match
+    added = max(-first_px, 0)
+    moved = apply_to_maps(match, lambda values: values[:, added:])
+    moved = replace(moved, disparity_px=moved.disparity_px + first_px)
+    if moved.confidence is None:
+        return moved
+    # The right view shows none of the first columns, even of what is farthest.
+    columns = torch.arange(moved.confidence.shape[1], device=moved.confidence.device)
+    return replace(moved, confidence=moved.confidence.where(columns >= first_px, 0.0))
 
 
 class CallableMatcher:
@@ -84,14 +152,20 @@ class CallableMatcher:
         self.function = function
         self.with_numpy_images = with_numpy_images
 
-    def match(self, left: Tensor, right: Tensor) -> Match:
+    def match(self, left: Tensor, right: Tensor, camera: Camera | None = None) -> Match:
         """Call the function, and refuse a result that is no disparity map.
+
+        Where ``camera`` has principal points apart, the function is given views that are moved so
+        that a disparity of 0 is infinitely far away.
 
         Raises:
             InputError: unusable images, or a result of another type or size, infinite, negative, or
                 NaN everywhere.
         """
-        check_pair(left, right)
+        return match_from_infinity(self._call, left, right, camera)
+
+    def _call(self, left: Tensor, right: Tensor) -> Match:
+        """Call the function, and refuse a result that is no disparity map."""
         views = (left, right)
         if self.with_numpy_images:
             views = tuple(view.permute(1, 2, 0).cpu().numpy() for view in views)
@@ -127,7 +201,7 @@ class CallableMatcher:
         return Match(disparity_px=disparity_px)
 
 
-def check_pair(left: object, right: object) -> None:
+def check_views(left: object, right: object) -> None:
     """Refuse what is not a pair of images, with a remedy.
 
     Raises:
@@ -157,15 +231,18 @@ class SGBMMatcher:
         self.config = config or SGBMConfig()
         self._cv2 = import_opencv("matching with StereoSGBM")
 
-    def match(self, left: Tensor, right: Tensor) -> Match:
-        """Match one pair.
+    def match(self, left: Tensor, right: Tensor, camera: Camera | None = None) -> Match:
+        """Match one pair, from infinity on.
 
         With filled holes the confidence is 0 there and 1 elsewhere; else it is None.
 
         Raises:
             InputError: unusable images, or images narrower than the disparity range.
         """
-        check_pair(left, right)
+        return match_from_infinity(self._match_from_zero, left, right, camera)
+
+    def _match_from_zero(self, left: Tensor, right: Tensor) -> Match:
+        """Match one pair through disparities from 0 px on."""
         if left.shape[-1] <= self.config.num_disparities:
             raise InputError(
                 f"images are {left.shape[-1]} px wide and num_disparities is "

@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import methodcaller
 from typing import Any, ClassVar
 
@@ -20,7 +21,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth import disparity
 from depthpose.depth.config import MatcherConfig, NetworkConfig
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.stereo.matcher import check_pair
+from depthpose.depth.stereo.matcher import Matcher, check_views, match_from_infinity
 from depthpose.depth.types import Map, Maps, Match, View, Views
 
 STEP_PX = 4
@@ -74,8 +75,7 @@ class NetworkMatcher(ABC):
         config: how it is run; None: the defaults.
 
     Raises:
-        InputError: the device does not exist on this machine; a largest disparity for a network
-            that searches those of its training alone.
+        InputError: the device does not exist on this machine.
     """
 
     fine_pixels: ClassVar[int]
@@ -84,19 +84,12 @@ class NetworkMatcher(ABC):
     """Largest factor by which the sides of an image are enlarged for a fine match."""
     largest_span_factor: ClassVar[float] = 1.5
     """Most disparities that a fine match searches, as a multiple of those of the training."""
-    finds_range: bool = False
-    """Whether the disparities of a pair are measured first, and searched where they lie."""
     activation_bytes: ClassVar[Callable[..., int]]
-    """Peak memory of a padded pair [bytes], by the network's config, height, width, type, rows."""
+    """Peak memory of a padded pair [bytes], by the network's config, span, height, width, type and
+    rows."""
 
     def __init__(self, network: StereoNetwork, config: MatcherConfig | None = None) -> None:
         config = config or MatcherConfig()
-        if config.max_disparity_px is not None and not self.finds_range:
-            raise InputError(
-                f"max_disparity_px is {config.max_disparity_px:g}, but this network searches the "
-                f"{network.config.max_disparity_px} disparities that it was trained with; omit it "
-                "(--max-disparity), or take weights with a light matcher, as 'default'"
-            )
         self.device = usable_device(config.device)
         precision = usable_precision(config.precision, config.device)
         self.config = replace(config, precision=precision)
@@ -113,173 +106,147 @@ class NetworkMatcher(ABC):
         """
 
     @abstractmethod
-    def run(
-        self,
-        left: Views,
-        right: Views,
-        network_config: Any,  # noqa: ANN401
-        first_px: int = 0,
-    ) -> list[Match]:
-        """Match normalised pairs whose sides suit the network.
+    def run(self, left: View, right: View, search: SearchRange) -> Match:
+        """Match a normalised pair whose sides suit the network.
 
         Args:
-            left: left views.
-            right: right views, the same size.
-            network_config: config of the network, perhaps of more disparities than in training.
-            first_px: the least disparity that is searched, a multiple of ``STEP_PX``; 0 for
-                networks that do not find the range.
+            left: left view, ``(3, H, W)``.
+            right: right view, the same size.
+            search: its ``first_px`` and ``span_px`` are the disparities that are searched.
 
         Returns:
-            A match for each pair, in pixels of these views; its disparities include ``first_px``.
+            The match, in pixels of these views; its disparities include ``first_px``.
         """
 
-    @torch.no_grad()
-    def match(self, left: Tensor, right: Tensor) -> Match:
-        """Match one pair of any size.
+    def match(self, left: Tensor, right: Tensor, camera: Camera | None = None) -> Match:
+        """Match one pair of any size within :meth:`usual_search`, from infinity on.
+
+        Args:
+            left: left image, ``(3, H, W)`` RGB in [0, 1].
+            right: right image, the same size.
+            camera: camera of the left image; None: it is not known.
+
+        Returns:
+            The match, at the size and on the device of ``left``.
 
         Raises:
             InputError: unusable images, or a memory bound that is too small for them.
         """
-        return self.match_many([(left, right)])[0]
+        match_from_zero = partial(match_in_usual_range, self, camera=camera)
+        return match_from_infinity(match_from_zero, left, right, camera)
 
     @torch.no_grad()
-    def match_many(
-        self,
-        pairs: Sequence[tuple[Tensor, Tensor]],
-        camera: Camera | None = None,
-        search: SearchRange | None = None,
-    ) -> list[Match]:
-        """Match pairs: together if all become one size and memory is unbounded, else one by one.
+    def match_within(
+        self, left: Tensor, right: Tensor, search: SearchRange, camera: Camera | None = None
+    ) -> Match:
+        """Match one pair at the size and within the disparities of a search.
 
         Args:
-            pairs: left and right images, as for :meth:`match`.
-            camera: camera of the left images, which are then matched at :meth:`work_size`; None: it
-                is not known.
-            search: size and disparities of the search, in place of those of the camera.
+            left: left image, as for :meth:`match`.
+            right: right image, the same size.
+            search: size and disparities.
+            camera: camera of the left image; with one, pixels become square.
 
         Returns:
-            A match of each pair, at its size and on its device.
+            The match, at the size and on the device of ``left``.
 
         Raises:
             InputError: as :meth:`match`.
         """
-        for left, right in pairs:
-            check_pair(left, right)
-        views, network_config = self._resize_views(pairs, camera, search)
-        first_px = 0 if search is None else search.first_px
-        is_one_size = len({left.shape for left, _ in views}) == 1
-        is_together = is_one_size and self.config.max_memory_bytes is None
-        groups = [views] if is_together else [[pair] for pair in views]
-        matches: list[Match] = []
-        for group in groups:
-            matches += self._match_group(group, network_config, first_px)
+        check_views(left, right)
+        height, width = left.shape[1:]
+        size = self._scale_size((height, width), search.scale, camera)
+        left_view, right_view = (
+            normalise(disparity.resize_image(view, *size).to(self.device, torch.float32))
+            for view in (left, right)
+        )
+        match = self._match_padded(left_view, right_view, search)
+        if self.config.with_left_right_check:
+            # Mirrored, the right view is a left one.
+            mirrored = self._match_padded(right_view.flip(-1), left_view.flip(-1), search)
+            match = lower_where_disagreeing(match, mirrored.disparity_px.flip(-1))
+        match = disparity.apply_to_maps(match, methodcaller("to", left.device))
+        return disparity.resize_match(match, height, width)
 
-        # Back to the size and the device of the images.
-        matches_of_images: list[Match] = []
-        for match, (left, _) in zip(matches, pairs, strict=True):
-            moved = disparity.apply_to_maps(match, methodcaller("to", left.device))
-            matches_of_images.append(disparity.resize_match(moved, *left.shape[1:]))
-        return matches_of_images
-
-    def _resize_views(
-        self,
-        pairs: Sequence[tuple[Tensor, Tensor]],
-        camera: Camera | None,
-        search: SearchRange | None,
-    ) -> tuple[Sequence[tuple[Tensor, ...]], Any]:
-        """Resize pairs to the size at which they are matched.
-
-        Returns:
-            The resized pairs; and the network's config, with the number of disparities for that
-            size.
-        """
-        trained = self.network_config
-        if search is not None:
-            sizes = [_compute_scaled_size(left, search.scale, camera) for left, _ in pairs]
-            largest_px = search.span_px
-        elif camera is not None and trained.work_focal_px is not None:
-            sizes = [self.work_size(camera)] * len(pairs)
-            largest_px = self.work_disparities(camera)
-        else:
-            return pairs, trained
-        views = [
-            tuple(disparity.resize_image(view, *size) for view in pair)
-            for pair, size in zip(pairs, sizes, strict=True)
-        ]
-        return views, replace(trained, max_disparity_px=largest_px)
-
-    def _match_group(
-        self,
-        group: Sequence[tuple[Tensor, ...]],
-        network_config: Any,  # noqa: ANN401
-        first_px: int,
-    ) -> list[Match]:
-        """Match pairs of one size in one call of the network, or two with the left-right check."""
-        lefts, rights = zip(*group, strict=True)
-        left = normalise(torch.stack(lefts).to(self.device, torch.float32))
-        right = normalise(torch.stack(rights).to(self.device, torch.float32))
-        matches = self._match_padded(left, right, network_config, first_px)
-        if not self.config.with_left_right_check:
-            return matches
-        # Mirrored, the right view is a left one.
-        mirrored = self._match_padded(right.flip(-1), left.flip(-1), network_config, first_px)
-        return [
-            lower_where_disagreeing(match, mirrored_match.disparity_px.flip(-1))
-            for match, mirrored_match in zip(matches, mirrored, strict=True)
-        ]
-
-    def _match_padded(
-        self,
-        left: Views,
-        right: Views,
-        network_config: Any,  # noqa: ANN401
-        first_px: int,
-    ) -> list[Match]:
-        """Pad pairs to sides that suit the network, match them, and crop the matches again.
+    def _match_padded(self, left: View, right: View, search: SearchRange) -> Match:
+        """Pad a pair to sides that suit the network, match it, and crop the match again.
 
         Raises:
             InputError: the network needs more memory than the config allows.
         """
-        height, width = left.shape[-2:]
-        padded_left = pad_top_right(left, network_config)
-        padded_right = pad_top_right(right, network_config)
-        self._refuse_memory(network_config, *padded_left.shape[-2:])
-        matches = self.run(padded_left, padded_right, network_config, first_px)
-        return [
-            disparity.apply_to_maps(match, lambda values: values[-height:, :width])
-            for match in matches
-        ]
+        height, width = left.shape[1:]
+        padded_left = pad_top_right(left, self.network_config)
+        padded_right = pad_top_right(right, self.network_config)
+        self._refuse_memory(search.span_px, *padded_left.shape[1:])
+        match = self.run(padded_left, padded_right, search)
+        return disparity.apply_to_maps(match, lambda values: values[-height:, :width])
 
-    def _refuse_memory(self, network_config: Any, height: int, width: int) -> None:  # noqa: ANN401
+    def _refuse_memory(self, span_px: int, height: int, width: int) -> None:
         """Refuse images whose matching takes more memory than the config allows."""
         limit_bytes = self.config.max_memory_bytes
         if limit_bytes is None:
             return
         rows = self._network.rows or height // 4  # of a volume, at quarter size
-        needed_bytes = self.activation_bytes(network_config, height, width, self.dtype, rows)
+        needed_bytes = self.activation_bytes(
+            self.network_config, span_px, height, width, self.dtype, rows
+        )
         if needed_bytes > limit_bytes:
-            quick = "" if network_config.work_focal_px is None else " or speed='quick'"
+            quick = "" if self.network_config.work_focal_px is None else " or speed='quick'"
             raise InputError(
                 f"max_memory_bytes={limit_bytes} is too small for images of "
                 f"{height}x{width} (padded): this matcher takes {needed_bytes}; allow "
                 f"that, take precision='bf16'{quick}, or match the pair at a smaller size"
             )
 
-    def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Compute the rows and columns at which images of a camera are matched [px]."""
-        if self.network_config.work_focal_px is None:
-            return camera.height, camera.width
-        return disparity.size_at_focal_length(camera, self.matching_focal_px(camera))
+    def usual_search(self, size: Sequence[int], camera: Camera | None) -> SearchRange:
+        """Compute the search of a camera's pairs, from 0 px on, without regard to their images.
 
-    def work_disparities(self, camera: Camera) -> int:
-        """Compute the number of disparities that are searched at :meth:`work_size` [px]."""
-        trained = self.network_config
-        if trained.work_focal_px is None:
-            return trained.max_disparity_px
+        Networks of one focal length see images at that; at the speed ``fine`` at that of an image
+        of ``fine_pixels``, where it is larger. Other networks, and images without a camera, are
+        matched at their own size.
+
+        Args:
+            size: rows and columns of the images.
+            camera: camera of the left image, where it is known.
+        """
+        trained_px = self.network_config.max_disparity_px
+        trained_focal_px = self.network_config.work_focal_px
+        if camera is None or trained_focal_px is None:
+            return SearchRange(scale=1.0, first_px=0, span_px=trained_px)
+        image_focal_px = float(camera.K[0, 0])
+        focal_px = trained_focal_px
+        if self.config.speed == "fine":
+            focal_px = max(trained_focal_px, image_focal_px * self.fine_scale(size))
         # Disparities grow with the focal length; the same filters search more of them.
-        ratio = self.matching_focal_px(camera) / trained.work_focal_px
-        span_factor = min(ratio, self.largest_span_factor)
-        return self.whole_steps(trained.max_disparity_px * span_factor)
+        span_factor = min(focal_px / trained_focal_px, self.largest_span_factor)
+        return SearchRange(
+            scale=focal_px / image_focal_px,
+            first_px=0,
+            span_px=self.whole_steps(trained_px * span_factor),
+        )
+
+    def fine_scale(self, size: Sequence[int]) -> float:
+        """Compute the factor by which the sides of images of a size change for a fine match."""
+        rows, columns = size
+        return min(math.sqrt(self.fine_pixels / (rows * columns)), self.largest_upscale)
+
+    def work_size(self, camera: Camera) -> tuple[int, int]:
+        """Compute the rows and columns at which images of a camera are usually matched [px]."""
+        size = (camera.height, camera.width)
+        return self._scale_size(size, self.usual_search(size, camera).scale, camera)
+
+    def _scale_size(
+        self, size: tuple[int, int], scale: float, camera: Camera | None
+    ) -> tuple[int, int]:
+        """Compute the rows and columns of scaled images; with a camera, pixels become square.
+
+        Networks that match pairs as they are leave the shape of pixels, too.
+        """
+        rows, columns = size
+        if camera is None or self.network_config.work_focal_px is None:
+            return max(1, round(rows * scale)), max(1, round(columns * scale))
+        camera = replace(camera, height=rows, width=columns)
+        return disparity.size_at_focal_length(camera, scale * float(camera.K[0, 0]))
 
     def whole_steps(self, disparity_px: float) -> int:
         """Round a number of disparities [px] up to a multiple of the network's step."""
@@ -287,27 +254,27 @@ class NetworkMatcher(ABC):
         without_float_error_px = round(disparity_px, 3)  # which would add a whole step
         return max(1, math.ceil(without_float_error_px / step_px)) * step_px
 
-    def matching_focal_px(self, camera: Camera) -> float:
-        """Compute the focal length at which images of a camera are matched [px].
 
-        At the speed ``fine`` it is that of an image of ``fine_pixels``, but at least that of the
-        training.
-        """
-        trained_px = self.network_config.work_focal_px
-        if trained_px is None:
-            return float(camera.K[0, 0])
-        if self.config.speed == "quick":
-            return trained_px
-        scale = math.sqrt(self.fine_pixels / (camera.height * camera.width))
-        fine_px = float(camera.K[0, 0]) * min(scale, self.largest_upscale)
-        return max(trained_px, fine_px)
+def match_in_usual_range(
+    matcher: Matcher, left: Tensor, right: Tensor, camera: Camera | None = None
+) -> Match:
+    """Match a pair within the usual search of its camera, without measuring its disparities.
 
+    So views are matched that a network synthesised, and pairs in exported graphs.
 
-def _compute_scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
-    """Compute the rows and columns of a scaled view; with a camera, pixels become square."""
-    if camera is not None:
-        return disparity.size_at_focal_length(camera, scale * float(camera.K[0, 0]))
-    return max(1, round(left.shape[1] * scale)), max(1, round(left.shape[2] * scale))
+    Args:
+        matcher: a network's; any other matches in its own way.
+        left: left image, ``(3, H, W)`` RGB in [0, 1].
+        right: right image, the same size.
+        camera: camera of the left image, where it is known.
+
+    Raises:
+        InputError: what the matcher raises.
+    """
+    if not isinstance(matcher, NetworkMatcher):
+        return matcher.match(left, right, camera)
+    search = matcher.usual_search(left.shape[1:], camera)
+    return matcher.match_within(left, right, search, camera)
 
 
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:

@@ -23,11 +23,16 @@ from depthpose.core.checkpoint import (
 )
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.depth.config import PSMNetConfig
+from depthpose.depth.config import MatcherConfig, PSMNetConfig
 from depthpose.depth.stereo import layers
 from depthpose.depth.stereo.layers import ConvNorm, Volume
-from depthpose.depth.stereo.network_matcher import STEP_PX, NetworkMatcher, StereoNetwork
-from depthpose.depth.types import Map, Maps, Match, Views
+from depthpose.depth.stereo.network_matcher import (
+    STEP_PX,
+    NetworkMatcher,
+    SearchRange,
+    StereoNetwork,
+)
+from depthpose.depth.types import Map, Maps, Match, View, Views
 
 CHUNK_BYTES = 6 << 20
 """Size of the rows of which the soft arg-min is computed at a time; it fits the caches."""
@@ -269,14 +274,14 @@ class PSMNet(StereoNetwork):
         return tuple(soft_argmin(cost, size, align_corners=align) for cost in used_costs)
 
     def costs(
-        self, left: Views, right: Views, max_disparity_px: int | None = None
+        self, left: Views, right: Views, span_px: int | None = None
     ) -> tuple[Volume, Volume, Volume]:
         """Compute the cost at quarter size after each hourglass; each adds to the one before.
 
-        ``max_disparity_px``: number of disparities, in place of that of the training: the same
-        filters can search more.
+        ``span_px``: number of disparities, in place of that of the training: the same filters can
+        search more.
         """
-        bins = (max_disparity_px or self.config.max_disparity_px) // STEP_PX
+        bins = (span_px or self.config.max_disparity_px) // STEP_PX
         volume = layers.by_rows(
             lambda left, right: self.aggregate(concatenation_volume(left, right, bins)),
             (self.features(left), self.features(right)),
@@ -316,15 +321,21 @@ ROWS = 32
 
 
 def psmnet_bytes(
-    config: PSMNetConfig, height: int, width: int, dtype: torch.dtype, rows: int = ROWS
+    config: PSMNetConfig,
+    span_px: int,
+    height: int,
+    width: int,
+    dtype: torch.dtype,
+    rows: int = ROWS,
 ) -> int:
     """Estimate the peak memory of matching a padded pair [bytes], with margin for the allocator.
 
-    Two volumes of the largest size are held whole; ``rows`` at quarter size are computed at a time.
+    Two volumes of ``span_px`` disparities are held whole; ``rows`` at quarter size are computed at
+    a time.
     """
     h = height // 4
     w = width // 4
-    bins = config.max_disparity_px // STEP_PX
+    bins = span_px // STEP_PX
     row_bytes = config.width * w * dtype.itemsize
     map_bytes = row_bytes * h
     volume_bytes = map_bytes * bins
@@ -352,11 +363,25 @@ def psmnet_bytes(
 
 
 class PSMNetMatcher(NetworkMatcher):
-    """PSMNet with pre- and post-processing, as :class:`NetworkMatcher` says."""
+    """PSMNet with pre- and post-processing, as :class:`NetworkMatcher` says.
+
+    Raises:
+        InputError: as for :class:`NetworkMatcher`; or a largest disparity, for it searches those of
+            its training.
+    """
 
     fine_pixels = 280_000
     """Pixels of a fine match at most: an image of KITTI at three quarters of its resolution."""
     activation_bytes = staticmethod(psmnet_bytes)
+
+    def __init__(self, network: PSMNet, config: MatcherConfig | None = None) -> None:
+        if config is not None and config.max_disparity_px is not None:
+            raise InputError(
+                f"max_disparity_px is {config.max_disparity_px:g}, but this network searches the "
+                f"{network.config.max_disparity_px} disparities that it was trained with; omit it "
+                "(--max-disparity), or take weights with a light matcher, as 'default'"
+            )
+        super().__init__(network, config)
 
     def fold(self, network: PSMNet, example: Tensor) -> PSMNet:
         """Keep the last convolution of each head in float32, fold the batch norms of the rest.
@@ -372,26 +397,20 @@ class PSMNetMatcher(NetworkMatcher):
         network.rows = ROWS
         return layers.fold(network, example)
 
-    def run(
-        self, left: Views, right: Views, network_config: PSMNetConfig, first_px: int = 0
-    ) -> list[Match]:
-        """Match normalised pairs whose sides suit the network."""
-        assert first_px == 0, "its volume begins at 0; the views are moved instead"
-        height, width = left.shape[-2:]
-        size = (network_config.max_disparity_px, height, width)
-        left = left.to(self.dtype, memory_format=torch.channels_last)
-        right = right.to(self.dtype, memory_format=torch.channels_last)
-        last_costs = self._network.costs(left, right, network_config.max_disparity_px)[-1][:, 0]
-        matches: list[Match] = []
-        for cost in last_costs:
-            disparity_px, confidence = expected_disparity(
-                cost.permute(1, 2, 0).contiguous(),
-                size,
-                align_corners=network_config.align_corners,
-                with_confidence=self.config.with_confidence,
-            )
-            matches.append(Match(disparity_px=disparity_px, confidence=confidence))
-        return matches
+    def run(self, left: View, right: View, search: SearchRange) -> Match:
+        """Match a normalised pair whose sides suit the network."""
+        assert search.first_px == 0, "its volume begins at 0"
+        height, width = left.shape[1:]
+        left_views = left[None].to(self.dtype, memory_format=torch.channels_last)
+        right_views = right[None].to(self.dtype, memory_format=torch.channels_last)
+        cost = self._network.costs(left_views, right_views, search.span_px)[-1][0, 0]
+        disparity_px, confidence = expected_disparity(
+            cost.permute(1, 2, 0).contiguous(),
+            (search.span_px, height, width),
+            align_corners=self._network.config.align_corners,
+            with_confidence=self.config.with_confidence,
+        )
+        return Match(disparity_px=disparity_px, confidence=confidence)
 
 
 _PARTS = {"0": "conv", "1": "norm"}

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
-from depthpose.depth.disparity import apply_to_maps, warp_right_to_left
+from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.stereo.network_matcher import (
     STEP_PX,
     NetworkMatcher,
@@ -37,54 +37,17 @@ _MIN_WARNED_SHARE = 0.001
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DisparityRange:
-    """The range of a pair's disparities, in pixels of its images, and the match that found it."""
+    """The range of a pair's disparities, and the match of the narrow copy that it is read from.
+
+    Everything is in pixels of the images, and maps have their size.
+    """
 
     low_px: float  #: the least disparity, at least that of what is infinitely far away
     high_px: float  #: the largest disparity
     step_px: float  #: error of both ends, by which they are set outwards
-    coarse: Match  #: the match of the narrow copy, at the size of the images
-    right_px: Map  #: disparity of the right view in the narrow copy, at the size of the images
-
-
-def move_views(left: Tensor, right: Tensor, first_px: int) -> tuple[Tensor, Tensor]:
-    """Move the views of a pair so that a disparity of ``first_px`` becomes 0.
-
-    The disparity of a point is its column in the left view less that in the right one. So the right
-    view moves to the right by ``first_px`` columns, or, where that is negative, the left view by
-    ``-first_px`` columns. Columns that become free repeat the border.
-
-    Args:
-        left: ``(3, H, W)``.
-        right: the same size.
-        first_px: in whole pixels, of either sign.
-
-    Returns:
-        The left and the right view, both ``(3, H, W)``; where ``first_px`` is negative both are
-        ``-first_px`` columns wider, so that nothing is cut off.
-    """
-    if first_px >= 0:
-        # The columns that are cut off match nothing at a disparity of first_px or more.
-        shifted_right = F.pad(right[None], (first_px, 0, 0, 0), mode="replicate")[0]
-        return left, shifted_right[..., : left.shape[2]]
-    # The right view stays in place, and is padded on the right to the width of the left view.
-    added = -first_px
-    shifted_left = F.pad(left[None], (added, 0, 0, 0), mode="replicate")[0]
-    padded_right = F.pad(right[None], (0, added, 0, 0), mode="replicate")[0]
-    return shifted_left, padded_right
-
-
-def move_match_back(match: Match, first_px: int) -> Match:
-    """Convert a match of moved views to the pixels of the views before :func:`move_views`."""
-    if first_px == 0:
-        return match
-    added = max(-first_px, 0)
-    moved = apply_to_maps(match, lambda values: values[:, added:])
-    moved = replace(moved, disparity_px=moved.disparity_px + first_px)
-    if moved.confidence is None:
-        return moved
-    # The right view shows none of the first columns, even of what is farthest.
-    columns = torch.arange(moved.confidence.shape[1], device=moved.confidence.device)
-    return replace(moved, confidence=moved.confidence.where(columns >= first_px, 0.0))
+    left_px: Map  #: disparity of the left view in the narrow copy
+    right_px: Map  #: disparity of the right view in the narrow copy
+    is_sure: Mask  #: left pixels whose disparity in the copy is no guess, however near it is
 
 
 def measure_disparity_range(
@@ -101,48 +64,30 @@ def measure_disparity_range(
     """
     # A copy so narrow that the network reaches every disparity, matched both ways.
     search = _search_of_narrow_copy(matcher, left.shape[2], infinity_px)
-    mirrored = (right.flip(-1), left.flip(-1))
-    coarse, mirrored_match = matcher.match_many([(left, right), mirrored], search=search)
-    disparity_px = coarse.disparity_px
+    match = matcher.match_within(left, right, search)
+    mirrored_match = matcher.match_within(right.flip(-1), left.flip(-1), search)
+    left_px = match.disparity_px
     right_px = mirrored_match.disparity_px.flip(-1)
-
-    # Borders without a picture match each other at any disparity.
-    is_picture = _find_picture_pixels(left, right, disparity_px)
-    confidence = coarse.confidence
-    if confidence is not None:
-        confidence = confidence.where(is_picture, 0.0)
-        coarse = replace(coarse, confidence=confidence)
+    step_px = STEP_PX / search.scale
 
     # The farthest point is measured where both views agree, which excludes hidden places and the
     # left border. The nearest is measured wherever the right view can show it: near things are
-    # often in one view alone, so there the views need not agree.
-    step_px = STEP_PX / search.scale
-    other_px = warp_right_to_left(right_px[None], disparity_px)[0]
-    counts_as_far = is_picture & ((disparity_px - other_px).abs() <= step_px)
-    columns = torch.arange(disparity_px.shape[1], device=disparity_px.device)
-    counts_as_near = is_picture & (disparity_px <= columns)
-    if confidence is not None:
-        counts_as_near &= confidence >= _MIN_NEAR_CONFIDENCE
+    # often in one view alone, so there the views need not agree. Borders without a picture match
+    # each other at any disparity.
+    is_picture = _find_picture_pixels(left, right, left_px)
+    is_agreed = is_picture & _find_agreeing_pixels(left_px, right_px, step_px)
+    is_sure = is_picture & _find_sure_pixels(match)
 
-    # The maps have the size of the images: one sample for each pixel of the narrow copy.
-    stride = max(1, round(1 / search.scale))
-    samples = (slice(None, None, stride), slice(None, None, stride))
-    sampled_px = disparity_px[samples]
-    far_px = sampled_px[counts_as_far[samples]].sort().values
-    near_px = sampled_px[counts_as_near[samples]].sort().values
-
-    # The range, without the outermost samples, which may be wrong matches.
-    tail = int(_TAIL * sampled_px.numel())
-    if min(len(far_px), len(near_px)) <= tail:  # too few are left: all samples count
-        far_px = near_px = sampled_px.flatten().sort().values
-    low_px = max(float(far_px[tail]) - step_px, infinity_px)
-    high_px = max(float(near_px[-1 - tail]) + step_px, low_px + step_px)
+    low_px, high_px = _find_ends(left_px, is_agreed, is_sure, search.scale)
+    low_px = max(low_px - step_px, infinity_px)
+    high_px = max(high_px + step_px, low_px + step_px)
     return DisparityRange(
         low_px=low_px,
         high_px=high_px,
         step_px=step_px,
-        coarse=coarse,
+        left_px=left_px,
         right_px=right_px,
+        is_sure=is_sure,
     )
 
 
@@ -154,8 +99,14 @@ def _search_of_narrow_copy(matcher: NetworkMatcher, width: int, infinity_px: flo
     trained_px = matcher.network_config.max_disparity_px
     span_px = matcher.whole_steps(trained_px * matcher.largest_span_factor)
     scale = min(1.0, span_px / (width + abs(infinity_px)))
-    first_px = STEP_PX * math.floor(infinity_px * scale / STEP_PX)
-    return SearchRange(scale=scale, first_px=first_px, span_px=span_px)
+    return SearchRange(
+        scale=scale, first_px=_whole_step_below(infinity_px * scale), span_px=span_px
+    )
+
+
+def _whole_step_below(disparity_px: float) -> int:
+    """Round a disparity down to one that a network has a score of [px]."""
+    return STEP_PX * math.floor(disparity_px / STEP_PX)
 
 
 def _find_picture_pixels(left: Tensor, right: Tensor, disparity_px: Map) -> Mask:
@@ -164,6 +115,45 @@ def _find_picture_pixels(left: Tensor, right: Tensor, disparity_px: Map) -> Mask
     right_blank = find_blank_borders(right).to(disparity_px)
     matched_blank = warp_right_to_left(right_blank[None], disparity_px)[0]
     return ~left_blank & ~(matched_blank > 0)
+
+
+def _find_agreeing_pixels(left_px: Map, right_px: Map, tolerance_px: float) -> Mask:
+    """Find the left pixels that have the disparity of the right pixels that they match."""
+    matched_px = warp_right_to_left(right_px[None], left_px)[0]
+    return (left_px - matched_px).abs() <= tolerance_px
+
+
+def _find_sure_pixels(match: Match) -> Mask:
+    """Find the left pixels that the right view can show, and whose match is more than a guess."""
+    columns = torch.arange(match.disparity_px.shape[1], device=match.disparity_px.device)
+    is_shown = match.disparity_px <= columns
+    if match.confidence is None:
+        return is_shown
+    return is_shown & (match.confidence >= _MIN_NEAR_CONFIDENCE)
+
+
+def _find_ends(
+    disparity_px: Map, counts_as_far: Mask, counts_as_near: Mask, scale: float
+) -> tuple[float, float]:
+    """Find the least and the largest disparity, without the outermost, which may be wrong.
+
+    Where too few pixels count, all do.
+
+    Args:
+        disparity_px: disparities of the narrow copy, at the size of the images.
+        counts_as_far: pixels of which one may be the farthest.
+        counts_as_near: pixels of which one may be the nearest.
+        scale: of the copy; one sample is taken for each of its pixels.
+    """
+    stride = max(1, round(1 / scale))
+    samples = (slice(None, None, stride), slice(None, None, stride))
+    sampled_px = disparity_px[samples]
+    far_px = sampled_px[counts_as_far[samples]].sort().values
+    near_px = sampled_px[counts_as_near[samples]].sort().values
+    tail = int(_TAIL * sampled_px.numel())
+    if min(len(far_px), len(near_px)) <= tail:
+        far_px = near_px = sampled_px.flatten().sort().values
+    return float(far_px[tail]), float(near_px[-1 - tail])
 
 
 def choose_search_range(
@@ -180,42 +170,26 @@ def choose_search_range(
         size: rows and columns of the images.
         camera: camera of the left image, where it is known.
     """
-    scale, usual_span_px = _choose_usual_scale_and_span(matcher, size, camera)
-    high_px = measured.high_px
-    if matcher.config.max_disparity_px is not None:
-        high_px = matcher.config.max_disparity_px
+    # What must be searched, in pixels of the images.
+    high_image_px = matcher.config.max_disparity_px or measured.high_px
+    span_image_px = max(high_image_px - measured.low_px, measured.step_px)
+
     # The volume has scale^2 H W pixels and scale * span disparities: a wider span is searched at a
     # smaller scale, so that scale^3 * span, and with it the memory, stays the same.
-    span_px = max(high_px - measured.low_px, measured.step_px)
-    if span_px * scale > usual_span_px:
-        scale = (usual_span_px * scale**2 / span_px) ** (1 / 3)
-    first_px = STEP_PX * math.floor(measured.low_px * scale / STEP_PX)
-    trained_px = matcher.network_config.max_disparity_px
-    searched_px = max(trained_px, matcher.whole_steps(high_px * scale - first_px))
-    return SearchRange(scale=scale, first_px=first_px, span_px=searched_px)
+    usual = matcher.usual_search(size, camera)
+    scale = usual.scale
+    if span_image_px * scale > usual.span_px:
+        scale = (usual.span_px * scale**2 / span_image_px) ** (1 / 3)
 
-
-def _choose_usual_scale_and_span(
-    matcher: NetworkMatcher, size: Sequence[int], camera: Camera | None
-) -> tuple[float, int]:
-    """Compute the scale and the span of a search, where the disparities need no wider span.
-
-    With a camera, the scale follows from the focal length; without one, a fine match has a fixed
-    number of pixels.
-
-    Returns:
-        The size at which the images are matched, as a multiple of their own; and how many
-        disparities are searched [px at that size].
-    """
-    trained = matcher.network_config
-    if camera is not None and trained.work_focal_px is not None:
-        scale = matcher.matching_focal_px(camera) / float(camera.K[0, 0])
-        return scale, matcher.work_disparities(camera)
-    if matcher.config.speed == "quick" or trained.work_focal_px is None:
-        return 1.0, trained.max_disparity_px
-    scale = math.sqrt(matcher.fine_pixels / (size[0] * size[1]))
-    span_px = matcher.whole_steps(trained.max_disparity_px * matcher.largest_span_factor)
-    return min(scale, matcher.largest_upscale), span_px
+    # The disparities, in pixels at that size.
+    first_work_px = _whole_step_below(measured.low_px * scale)
+    span_work_px = matcher.whole_steps(high_image_px * scale - first_work_px)
+    trained_work_px = matcher.network_config.max_disparity_px
+    return SearchRange(
+        scale=scale,
+        first_px=first_work_px,
+        span_px=max(trained_work_px, span_work_px),
+    )
 
 
 def doubt_hidden(match: Match, measured: DisparityRange) -> Match:
@@ -230,47 +204,56 @@ def doubt_hidden(match: Match, measured: DisparityRange) -> Match:
     return lower_where_disagreeing(match, measured.right_px, pixel_px, 2 * pixel_px)
 
 
-def doubt_outside(match: Match, measured: DisparityRange, search: SearchRange) -> tuple[Match, str]:
-    """Set the confidence to 0 where the true disparity may lie beyond what was searched.
+def doubt_outside(
+    match: Match,
+    measured: DisparityRange,
+    search: SearchRange,
+    max_disparity_px: float | None = None,
+) -> Match:
+    """Doubt what lies beyond the search, or beyond a largest disparity, and warn of it.
 
-    That is where the narrow copy has a larger disparity than was searched, and where the match is
-    the last disparity of the search.
+    The confidence becomes 0 where the narrow copy has a larger disparity than was searched, where
+    the match is the last disparity of the search, and where it is larger than
+    ``max_disparity_px``.
 
     Args:
         match: the match of the pair.
-        measured: the range of the disparities, with the match of the narrow copy.
+        measured: the range of the disparities, with those of the narrow copy.
         search: the search of ``match``.
+        max_disparity_px: the largest disparity that counts, in pixels of the images; None: any.
 
     Returns:
-        The match; and a warning with the share of pixels beyond the search, counted where the copy
-        is sure and the right view can show them; "" where the share is small.
+        The match. Its ``warning`` is the share of pixels that surely lie beyond, unless that is
+        small.
     """
-    if match.confidence is None:
-        return match, ""
-    coarse_px = measured.coarse.disparity_px
-    coarse_confidence = measured.coarse.confidence
     end_px = search.end_in_images_px
-    # Neighbours within two pixels of the copy, its error, may lie beyond too.
-    may_be_beyond = coarse_px > end_px - measured.step_px
-    if bool(may_be_beyond.any()):
-        may_be_beyond = _dilate(may_be_beyond, round(2 * measured.step_px / STEP_PX))
-    is_last = match.disparity_px > end_px - STEP_PX / search.scale
-    doubted = replace(match, confidence=match.confidence.masked_fill(may_be_beyond | is_last, 0.0))
+    limit_px = math.inf if max_disparity_px is None else max_disparity_px
+    is_beyond_limit = match.disparity_px > limit_px
+    if match.is_sky is not None:  # its disparity has no meaning
+        is_beyond_limit &= ~match.is_sky
 
-    # What is surely beyond is counted for the warning.
-    is_beyond = coarse_px > end_px + measured.step_px
-    is_beyond &= coarse_px <= torch.arange(coarse_px.shape[1], device=coarse_px.device)
-    if coarse_confidence is not None:
-        is_beyond &= coarse_confidence >= _MIN_NEAR_CONFIDENCE
+    if match.confidence is not None:
+        may_be_beyond = measured.left_px > end_px - measured.step_px
+        if bool(may_be_beyond.any()):
+            # Neighbours within two pixels of the copy, its error, may lie beyond too.
+            may_be_beyond = _dilate(may_be_beyond, round(2 * measured.step_px / STEP_PX))
+        is_last = match.disparity_px > end_px - STEP_PX / search.scale
+        is_doubtful = may_be_beyond | is_last | is_beyond_limit
+        match = replace(match, confidence=match.confidence.masked_fill(is_doubtful, 0.0))
+
+    is_beyond_search = measured.left_px > end_px + measured.step_px
+    is_beyond = (is_beyond_search | is_beyond_limit) & measured.is_sure
     share = float(is_beyond.float().mean())
     if share < _MIN_WARNED_SHARE:
-        return doubted, ""
-    return doubted, (
-        f"{share:.1%} of the image have disparities beyond {end_px:.0f} px, the largest "
-        f"that was searched (up to {float(coarse_px[is_beyond].max()):.0f} px); their confidence "
-        "is 0. Give a larger --max-disparity (in Python MatcherConfig(max_disparity_px=...)), or "
-        "none, and it is measured"
+        return match
+    largest_px = torch.maximum(measured.left_px, match.disparity_px)[is_beyond].max()
+    warning = (
+        f"{share:.1%} of the image have disparities beyond {min(end_px, limit_px):.0f} px, the "
+        f"limit of the search (up to {float(largest_px):.0f} px); they have no confidence. Give a "
+        "larger --max-disparity (in Python MatcherConfig(max_disparity_px=...)), or none, and it "
+        "is measured"
     )
+    return replace(match, warning=warning)
 
 
 def _dilate(mask: Mask, radius: int) -> Mask:
