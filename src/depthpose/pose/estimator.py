@@ -308,10 +308,8 @@ class PoseEstimator:
             if asked is None
             else [self._find_object(name).model.name for name in asked]
         )
-        if not names:
-            raise InputError("find: objects names none; give those that may be there, or omit it")
         # A view names one object, which a search does not read.
-        view = view_input(depth, None, camera, names[0], _NAME, unit)
+        view = view_input(depth, None, camera, self.objects[0], _NAME, unit)
         view = add_background(view, background, camera, unit)
         return [estimate for estimate in self.find_in(view, names) if estimate.is_posed]
 
@@ -325,7 +323,12 @@ class PoseEstimator:
         Args:
             view: depth and camera.
             objects: which may be there.
+
+        Raises:
+            InputError: an unknown object, or none.
         """
+        if not objects:
+            raise InputError("find: objects names none; give those that may be there, or omit it")
         return find_objects(view, self._targets(objects))
 
     def track(
