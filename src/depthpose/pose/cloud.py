@@ -22,11 +22,17 @@ from depthpose.pose.types import (
 
 _MAJORITY = 0.5  # share from which most points or pixels are of a kind
 _WIDEST_TANGENT = 1.73  # of 60 degrees: points that a camera sees lie less far off its axis
+_STEEPEST_TANGENT = 10.0  # of 84 degrees: no camera sees a point farther off its axis, or behind it
 _LEAST_DEPTH_DIAMETERS = 0.05  # least depth of nearly all points that a camera saw
 _NEARLY_ALL = 0.95  # share of points that makes nearly all
 _SAMPLED_DEPTHS = 10_000  # readings by which the depth of nearly all is measured
 _FLAT_DIAMETERS = 0.002  # root mean square below which a cloud has no extent along an axis
 _FARTHEST_M = 1e6  # a coordinate beyond this marks a missing reading
+OTHER_FRAME = (
+    "Or is the cloud not in the camera's frame (x right, y down, z forward)? A robot's base and "
+    "the world have z up: give it as the camera saw it"
+)
+"""What may be wrong with a cloud that fits no pose: its origin is not where the camera was."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,8 +67,7 @@ def prepare_cloud(
     is_masked = True
     if isinstance(pose_input, ViewInput):
         view = pose_input
-        mask = view.mask if view.background is None else view.mask & ~view.background.is_seen
-        points_m = cloud_from_depth(view.depth_m, mask, view.K).float()
+        points_m = cloud_from_depth(view.depth_m, view.foreground, view.K).float()
     else:
         view = pose_input.view
         is_masked = pose_input.is_masked
@@ -71,8 +76,9 @@ def prepare_cloud(
     if len(readings_m) == 0:
         return Refusal(status="too few points", reason=_explain_emptiness(pose_input))
 
-    # Those near their median, if they can be posed.
+    # Those near their median that a camera can see, if they can be posed.
     cloud_m = _drop_flying_pixels(readings_m, model.diameter_m, cloud_config)
+    cloud_m = cloud_m[_is_before_camera(cloud_m)]
     refusal = _refuse_unposable(pose_input, readings_m, cloud_m, model, cloud_config)
     if refusal is not None:
         return refusal
@@ -113,7 +119,7 @@ def _refuse_unposable(
 ) -> Refusal | None:
     """Refuse a cloud that cannot be posed, by its size, place and shape; None where it can.
 
-    ``readings_m`` are all readings in the mask, ``cloud_m`` those without flying pixels.
+    ``readings_m`` are all readings in the mask, ``cloud_m`` those that are used.
     """
     # First of all readings: few of them do not say whether the unit or the frame is another.
     too_few = why_too_few(readings_m, cloud_config)
@@ -151,7 +157,7 @@ def _explain_other_frame_or_unit(
 ) -> str | None:
     """Explain that a cloud is in another frame or unit than camera and model; None where it is not.
 
-    ``readings_m`` are all readings in the mask, ``cloud_m`` those without flying pixels.
+    ``readings_m`` are all readings in the mask, ``cloud_m`` those that are used.
     """
     # The size is measured without flying pixels, if those are few.
     has_few_flying = len(cloud_m) > _MAJORITY * len(readings_m)
@@ -170,6 +176,12 @@ def _explain_other_frame_or_unit(
     axes_advice = advise_frame(readings_m)
     if axes_advice is not None:
         return axes_advice
+    unseen = float((~_is_before_camera(readings_m)).float().mean())
+    if size_advice is None and unseen > 1 - _NEARLY_ALL:
+        return (
+            f"{unseen:.0%} of the points lie behind the camera or beside it, where it sees none: "
+            f"are they another sensor's? {OTHER_FRAME}"
+        )
     if size_advice is None:
         return None
     # Some background in the mask makes a cloud larger, and does not mean another unit.
@@ -268,6 +280,12 @@ def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:
             grown.narrow(axis, 0, kept).logical_or_(source.narrow(axis, moved_px, kept))
             grown.narrow(axis, moved_px, kept).logical_or_(source.narrow(axis, 0, kept))
     return grown if grow_px >= 0 else ~grown
+
+
+def _is_before_camera(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Mark the points of the camera frame that a camera can see: before it, and not far aside."""
+    aside_m = points_m[:, :2].abs().amax(-1)
+    return points_m[:, 2] > aside_m / _STEEPEST_TANGENT
 
 
 def is_reading(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:

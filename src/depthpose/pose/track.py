@@ -88,7 +88,7 @@ def _gather_scene(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float
 def _lift_square_about(
     view: ViewInput, middle_m: Float64[Tensor, "3"], radius_m: float
 ) -> Float64[Tensor, "n 3"]:
-    """Lift the masked pixels in a square about a ball to points of the camera frame."""
+    """Lift the foreground in a square about a ball to points of the camera frame."""
     # The square in the image.
     z_m = float(middle_m[2])
     K = view.K.double()
@@ -104,7 +104,7 @@ def _lift_square_about(
 
     window = (slice(top, bottom), slice(left, right))
     window_K = crop_intrinsics(K, left, top)
-    return cloud_from_depth(view.depth_m[window], view.mask[window], window_K).double()
+    return cloud_from_depth(view.depth_m[window], view.foreground[window], window_K).double()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

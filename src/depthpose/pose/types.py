@@ -123,6 +123,11 @@ class ViewInput:
     background: KnownBackground | None = None  #: of this view; None: it is not known
 
     @cached_property
+    def foreground(self) -> Bool[Tensor, "h w"]:
+        """The pixels of the mask whose readings do not lie on the known background."""
+        return self.mask if self.background is None else self.mask & ~self.background.is_seen
+
+    @cached_property
     def shared_per_white(self) -> float:
         """Error that neighbouring readings share, over the noise of one reading."""
         return measure_shared_per_white(self.depth_m)

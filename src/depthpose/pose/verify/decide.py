@@ -10,7 +10,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import ObjectCloud
+from depthpose.pose.cloud import OTHER_FRAME, ObjectCloud
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.types import Alternative, AnyInput, Evidence, PoseEstimate, Refusal
 from depthpose.pose.verify.copies import describe_difference
@@ -27,11 +27,6 @@ from depthpose.pose.verify.probability import (
     share_among_objects,
 )
 
-OTHER_FRAME = (
-    ". Or is the cloud not in the camera's frame (x right, y down, z forward)? A robot's base and "
-    "the world have z up: give it as the camera saw it"
-)
-"""What may be wrong with a cloud that fits no pose: its origin is not where the camera was."""
 _HIDDEN_WEIGHT = 0.5
 """Of an area that was not observed beside one that contradicts: it may only be hidden."""
 _LEAST_CONTRADICTING = LEAST_AREA / 4
@@ -98,7 +93,7 @@ def decide(
         "identity": identity,
     }
     # A cloud, other than a depth image, may be in another frame than the camera's.
-    hint = OTHER_FRAME if cloud.view is None else ""
+    hint = f". {OTHER_FRAME}" if cloud.view is None else ""
     if withheld is not None:  # all but the pose, so that nobody takes it for an estimate
         reason = withheld.reason + (hint if withheld.status == "doubtful" else "")
         return PoseEstimate(status=withheld.status, reason=reason, **facts)
