@@ -26,7 +26,7 @@ from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
 from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
-from depthpose.pose.cloud import ObjectCloud, prepare_cloud
+from depthpose.pose.cloud import prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
 from depthpose.pose.mesh import (
     make_model,
@@ -226,8 +226,7 @@ def test_a_part_may_be_longer_than_its_distance() -> None:
     view = ViewInput(name="rail", depth_m=depth_m, mask=mask, K=K, object=model.name)
     cloud = CloudInput(name="rail", points_m=back_project(depth_m, K)[mask], object=model.name)
     for given in (view, cloud):
-        prepared = prepare_cloud(given, model, CloudConfig(), EstimateConfig())
-        assert isinstance(prepared, ObjectCloud), prepared
+        prepare_cloud(given, model, CloudConfig(), EstimateConfig())  # raises nothing
 
 
 def test_points_without_a_reading_take_no_others_place(part: ObjectModel) -> None:
@@ -238,7 +237,6 @@ def test_points_without_a_reading_take_no_others_place(part: ObjectModel) -> Non
     grid[:: 150_000 // len(points_m)][: len(points_m)] = points_m
     given = CloudInput(name="x", points_m=grid, object=part.name)
     prepared = prepare_cloud(given, part, CloudConfig(), EstimateConfig())
-    assert isinstance(prepared, ObjectCloud)
     assert len(prepared.cloud_m) > 0.95 * len(points_m)
 
 
@@ -267,7 +265,6 @@ def test_stray_points_that_no_camera_sees_are_left_out(part: ObjectModel) -> Non
     strays_m = torch.tensor([[0.0, 0.0, -0.05], [0.1, 0.0, 0.0], [0.1, 0.0, 1e-6]])
     given = CloudInput(name="x", points_m=torch.cat([points_m, strays_m]), object=part.name)
     prepared = prepare_cloud(given, part, CloudConfig(), EstimateConfig())
-    assert isinstance(prepared, ObjectCloud), prepared
     assert torch.equal(prepared.cloud_m, points_m)
 
 

@@ -220,7 +220,7 @@ def test_a_cloud_that_may_show_anything_needs_more_evidence() -> None:
     truth = pose_at(seed=3)
     net = Oracle(tiny_weights(bracket()), [truth])
     given = CloudInput(name="a", points_m=cloud_of(bracket(), truth), object="bracket")
-    (asked,) = net._estimate_or_raise([given], is_expected=False)
+    asked = net._estimate(given, is_expected=False)
     (masked,) = net.estimate_many([given])
     assert asked.certainty is not None
     assert masked.certainty is not None

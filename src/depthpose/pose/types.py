@@ -33,14 +33,6 @@ mirror image fits better than the sensor explains."""
 POSED: tuple[Status, ...] = ("ok", "ambiguous")  #: the statuses of an estimate with a pose
 
 
-@dataclass(frozen=True, kw_only=True)
-class Refusal:
-    """Why there is no pose."""
-
-    status: Status  #: the kind of refusal
-    reason: str  #: one sentence for people
-
-
 Tracking = Literal["tracked", "found", "lost"]
 """How an estimate of a sequence came about: followed from the frame before, found by a new search,
 or neither."""
