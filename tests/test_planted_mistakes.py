@@ -32,7 +32,8 @@ from depthpose.pose.cloud import prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig
 from depthpose.pose.inputs import AnyInput, cloud_input, view_input
 from depthpose.pose.mesh import read_model
-from depthpose.pose.types import CloudInput, Refusal, ViewInput
+from depthpose.pose.refusals import Refused
+from depthpose.pose.types import CloudInput, ViewInput
 
 CAMERA: dict[str, Any] = {
     "width": 640,
@@ -51,10 +52,8 @@ def said_by(work: Callable[[], object]) -> str:
     """What is answered: an error, a refusal or advice; nothing where all is well."""
     try:
         answer = work()
-    except InputError as error:
+    except (InputError, Refused) as error:
         return str(error)
-    if isinstance(answer, Refusal):
-        return answer.reason
     return answer if isinstance(answer, str) else ""
 
 

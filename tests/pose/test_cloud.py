@@ -8,9 +8,10 @@ from depthpose.core.camera import project
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_image
-from depthpose.pose.cloud import cloud_from_depth, is_reading, why_too_few
+from depthpose.pose.cloud import cloud_from_depth, is_reading, require_points
 from depthpose.pose.config import SHAPE_FEATURES, CloudConfig
 from depthpose.pose.geometry.grid import rotation_from_z_to, sample_points, voxelise
+from depthpose.pose.refusals import Refused
 from depthpose.pose.types import CloudInput
 from depthpose.report.pose import select_object_points
 
@@ -53,13 +54,17 @@ def test_a_mask_of_another_size_is_refused() -> None:
 
 
 def test_too_small_a_cloud_is_refused_with_a_reason() -> None:
-    assert why_too_few(torch.rand(16, 3)) is None
-    assert why_too_few(torch.rand(15, 3)) == (
+    require_points(torch.rand(16, 3))
+    with pytest.raises(Refused) as refused:
+        require_points(torch.rand(15, 3))
+    assert refused.value.status == "too few points"
+    assert refused.value.reason == (
         "the cloud has 15 points, fewer than the 16 that a pose takes: is the mask empty, or the "
         "depth missing there?"
     )
     empty = cloud_from_depth(torch.ones(4, 4), torch.zeros(4, 4, dtype=torch.bool), K, 0.1)
-    assert "0 points" in (why_too_few(empty) or "")
+    with pytest.raises(Refused, match="0 points"):
+        require_points(empty)
 
 
 def plain(voxel_m: float) -> CloudConfig:

@@ -26,7 +26,7 @@ from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
 from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
-from depthpose.pose.cloud import ObjectCloud, prepare_cloud
+from depthpose.pose.cloud import prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
 from depthpose.pose.mesh import (
     make_model,
@@ -36,6 +36,7 @@ from depthpose.pose.mesh import (
 )
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.network_pose import GeoPoseNet
+from depthpose.pose.registration import Registration
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import write_pose_weights
 
@@ -225,8 +226,7 @@ def test_a_part_may_be_longer_than_its_distance() -> None:
     view = ViewInput(name="rail", depth_m=depth_m, mask=mask, K=K, object=model.name)
     cloud = CloudInput(name="rail", points_m=back_project(depth_m, K)[mask], object=model.name)
     for given in (view, cloud):
-        prepared = prepare_cloud(given, model, CloudConfig(), EstimateConfig())
-        assert isinstance(prepared, ObjectCloud), prepared
+        prepare_cloud(given, model, CloudConfig(), EstimateConfig())  # raises nothing
 
 
 def test_points_without_a_reading_take_no_others_place(part: ObjectModel) -> None:
@@ -237,8 +237,35 @@ def test_points_without_a_reading_take_no_others_place(part: ObjectModel) -> Non
     grid[:: 150_000 // len(points_m)][: len(points_m)] = points_m
     given = CloudInput(name="x", points_m=grid, object=part.name)
     prepared = prepare_cloud(given, part, CloudConfig(), EstimateConfig())
-    assert isinstance(prepared, ObjectCloud)
     assert len(prepared.cloud_m) > 0.95 * len(points_m)
+
+
+def test_a_cloud_of_which_the_camera_sees_a_part_costs_the_others_nothing(
+    part: ObjectModel,
+) -> None:
+    """A part that stands on its end, in the frame of a table: some points are below the table."""
+    truth = pose_at(seed=3)
+    seen_m = cloud_of(part, truth).float()
+    standing_m = truth.inverse().apply(seen_m)[:, [1, 2, 0]]
+    table_m = standing_m - standing_m.amin(0) + torch.tensor([0.08, 0.08, -0.03])
+    given = [
+        CloudInput(name="table", points_m=table_m, object=part.name),
+        CloudInput(name="camera", points_m=seen_m, object=part.name),
+    ]
+    below, found = Registration([part]).estimate_many(given)
+    assert found.is_posed, found.reason
+    assert below.status == "unusable input"
+    assert "of the points lie behind the camera or beside it" in below.reason
+    assert "Or is the cloud not in the camera's frame (x right, y down, z forward)?" in below.reason
+
+
+def test_stray_points_that_no_camera_sees_are_left_out(part: ObjectModel) -> None:
+    near = Rigid(pose_at(seed=3).R, torch.tensor([0.0, 0.0, 0.25]))
+    points_m = cloud_of(part, near).float()
+    strays_m = torch.tensor([[0.0, 0.0, -0.05], [0.1, 0.0, 0.0], [0.1, 0.0, 1e-6]])
+    given = CloudInput(name="x", points_m=torch.cat([points_m, strays_m]), object=part.name)
+    prepared = prepare_cloud(given, part, CloudConfig(), EstimateConfig())
+    assert torch.equal(prepared.cloud_m, points_m)
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.footprint import explained_mask
 from depthpose.pose.geometry.surface import NEAR, prepare_surface
+from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.search import nothing_found
@@ -157,6 +158,14 @@ def test_an_object_that_the_weights_do_not_know_is_refused() -> None:
         net.find(table(), CAMERA, ["spoon"])
 
 
+def test_a_search_for_nothing_is_an_error() -> None:
+    net = Oracle(tiny_weights(bracket()), TRUTHS)
+    with pytest.raises(InputError, match="find: objects names none"):
+        net.find(table(), CAMERA, [])
+    with pytest.raises(InputError, match="find: objects names none"):
+        net.find_in(view_input(table(), None, CAMERA, "bracket", "a"), [])
+
+
 def cloud_of(model: ObjectModel, truth: Rigid) -> torch.Tensor:
     depth_m, mask = view_of(model, truth)
     return back_project(depth_m.double(), K)[mask].float()
@@ -211,7 +220,7 @@ def test_a_cloud_that_may_show_anything_needs_more_evidence() -> None:
     truth = pose_at(seed=3)
     net = Oracle(tiny_weights(bracket()), [truth])
     given = CloudInput(name="a", points_m=cloud_of(bracket(), truth), object="bracket")
-    (asked,) = net._estimate_or_raise([given], is_expected=False)
+    asked = net._estimate(given, is_expected=False)
     (masked,) = net.estimate_many([given])
     assert asked.certainty is not None
     assert masked.certainty is not None

@@ -55,6 +55,16 @@ def test_a_unit_says_what_whole_numbers_and_floats_are() -> None:
     torch.testing.assert_close(view.depth_m, DEPTH_M, atol=2e-4, rtol=0)
 
 
+def test_readings_out_of_range_are_no_readings() -> None:
+    """ROS writes +inf beyond the largest distance of a sensor, and -inf below the least."""
+    depth_m = DEPTH_M.clone()
+    depth_m[0] = torch.inf
+    depth_m[1] = -torch.inf
+    view = view_input(depth_m, MASK, K, "part", "view")
+    assert bool(view.depth_m[:2].isnan().all())
+    assert torch.equal(view.depth_m[2:], DEPTH_M[2:])
+
+
 def test_two_units_that_disagree_are_refused() -> None:
     tum = Camera(width=64, height=48, K=K, depth_unit_m=0.0002)
     with pytest.raises(

@@ -7,6 +7,7 @@ import torch
 from bench.negatives import NegativeKind, mirrored, negative_of, scaled
 from tests.pose.synthetic_objects import (
     Oracle,
+    box_faces,
     bracket,
     bracket_surface,
     cloud_of,
@@ -21,8 +22,9 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.icp import refine_exactly
+from depthpose.pose.mesh import make_model
 from depthpose.pose.types import PoseEstimate
-from depthpose.pose.verify.identity import Scale, measure_scale
+from depthpose.pose.verify.identity import Scale, _fit_scale, measure_scale
 
 TRUTH = pose_at(seed=1)
 
@@ -53,6 +55,27 @@ def test_the_deviation_of_a_scale_is_that_of_errors_that_neighbours_share() -> N
         scale = measure_scale(seen_m, pose, surface)
         errors.append((scale.times - 1) / scale.sigma)
     assert 0.4 < float(torch.tensor(errors).square().mean().sqrt()) < 1.6
+
+
+@pytest.mark.parametrize("far", [1.05, 1.4])
+def test_a_step_that_only_shifts_is_not_the_last(far: float) -> None:
+    """Points beyond the last limit of the distance pull a cube aside, and neither turn nor grow it.
+
+    The first steps, whose limits are wider, shift it; with the last limit it is back.
+    """
+    corners, faces = box_faces()
+    surface = prepare_surface(make_model(0.1 * corners, faces, name="cube"))
+    lines = torch.linspace(-0.035, 0.035, 8, dtype=torch.float64)
+    a, b = torch.cartesian_prod(lines, lines).T
+    half = torch.full_like(a, 0.05)
+    sides = [(half, a, b), (-half, a, b), (a, half, b), (a, -half, b), (a, b, half), (a, b, -half)]
+    cube_m = torch.cat([torch.stack(side, -1) for side in sides])
+    is_middle = (cube_m[:, 0].abs() == 0.05) & (cube_m[:, 1:].abs() < 0.02).all(-1)
+    beside_m = cube_m[is_middle] + torch.tensor([far * surface.near_m, 0.0, 0.0])
+    points_m = torch.cat([cube_m, beside_m])
+    start = torch.ones(1, dtype=torch.float64)
+    _, moved_m = _fit_scale(points_m[None], start, surface, is_exact=True)
+    assert float((moved_m[0] - points_m).norm(dim=-1).max()) < 1e-5
 
 
 def estimated(times: float, max_size_error: float = 0.03) -> PoseEstimate:

@@ -19,6 +19,7 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.core.camera import Camera, back_project
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
+from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose import search
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import EstimateConfig, RefusalConfig
@@ -269,6 +270,7 @@ def test_turns_that_fit_as_well_are_named() -> None:
         net._find_object("mug").prepare(),
         net.config,
         RefusalConfig(min_observability=0.0, min_probability=0.0),
+        Stopwatch(),
         proposals=truth[None],
         prior_odds=PRIOR_PROPOSED,
     )
@@ -315,11 +317,11 @@ def test_forty_models_take_bounded_time(net: Registration, monkeypatch: pytest.M
 
     def count(
         cloud: CloudInput, prepared: PreparedObject, config: EstimateConfig,
-        refusal: RefusalConfig, *, proposals: Rigid, prior_odds: float,
+        refusal: RefusalConfig, watch: Stopwatch, *, proposals: Rigid, prior_odds: float,
     ) -> PoseEstimate:  # fmt: skip
         registered.append(cloud.name)
         return register(
-            cloud, prepared, config, refusal, proposals=proposals, prior_odds=prior_odds
+            cloud, prepared, config, refusal, watch, proposals=proposals, prior_odds=prior_odds
         )
 
     monkeypatch.setattr(search, "register", count)

@@ -128,10 +128,12 @@ def test_the_depth_image_trains_and_its_file_is_a_regressors(
     assert set(found.seconds) == {"network", "icp"}
     assert (refused.status, refused.is_ok) == ("too few points", False)
     cloud = CloudInput(name="c", points_m=torch.rand(50, 3), object="bracket")
-    found = regressor.estimate_many([dataclasses.replace(view, object="cup"), cloud])
-    assert [one.status for one in found] == ["unreadable"] * 2
+    cropped = dataclasses.replace(view, mask=view.mask[:9])
+    found = regressor.estimate_many([dataclasses.replace(view, object="cup"), cloud, cropped])
+    assert [one.status for one in found] == ["unreadable"] * 3
     assert "'cup': the weights do not know it" in found[0].reason
     assert "takes a depth image with a mask" in found[1].reason
+    assert "give the mask of this very image" in found[2].reason
     with pytest.raises(InputError, match="takes a depth image with a mask"):
         regressor.estimate(cloud=cloud.points_m, object="bracket")
 

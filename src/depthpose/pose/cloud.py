@@ -11,22 +11,28 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.pose.config import CloudConfig, EstimateConfig
+from depthpose.pose.refusals import Refused
 from depthpose.pose.types import (
     CloudInput,
     CloudSample,
     ObjectModel,
-    Refusal,
     ViewInput,
     ViewSample,
 )
 
 _MAJORITY = 0.5  # share from which most points or pixels are of a kind
 _WIDEST_TANGENT = 1.73  # of 60 degrees: points that a camera sees lie less far off its axis
+_STEEPEST_TANGENT = 10.0  # of 84 degrees: no camera sees a point farther off its axis, or behind it
 _LEAST_DEPTH_DIAMETERS = 0.05  # least depth of nearly all points that a camera saw
 _NEARLY_ALL = 0.95  # share of points that makes nearly all
 _SAMPLED_DEPTHS = 10_000  # readings by which the depth of nearly all is measured
 _FLAT_DIAMETERS = 0.002  # root mean square below which a cloud has no extent along an axis
 _FARTHEST_M = 1e6  # a coordinate beyond this marks a missing reading
+OTHER_FRAME = (
+    "Or is the cloud not in the camera's frame (x right, y down, z forward)? A robot's base and "
+    "the world have z up: give it as the camera saw it"
+)
+"""What may be wrong with a cloud that fits no pose: its origin is not where the camera was."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,8 +51,8 @@ def prepare_cloud(
     model: ObjectModel,
     cloud_config: CloudConfig,
     config: EstimateConfig,
-) -> ObjectCloud | Refusal:
-    """Lift an input to the usable points of its object; a refusal where it cannot be posed.
+) -> ObjectCloud:
+    """Lift an input to the usable points of its object.
 
     Args:
         pose_input: a cloud, or a depth image with a mask.
@@ -56,26 +62,30 @@ def prepare_cloud(
 
     Raises:
         InputError: mask and depth differ in size.
+        Refused: it cannot be posed, by its size, place or shape.
     """
     # The readings that may be the object's.
     is_masked = True
     if isinstance(pose_input, ViewInput):
         view = pose_input
-        mask = view.mask if view.background is None else view.mask & ~view.background.is_seen
-        points_m = cloud_from_depth(view.depth_m, mask, view.K).float()
+        require_same_size(view.mask, view.depth_m)
+        points_m = cloud_from_depth(view.depth_m, view.foreground, view.K).float()
     else:
         view = pose_input.view
         is_masked = pose_input.is_masked
         points_m = pose_input.points_m.float()
     readings_m = take_evenly(points_m[is_reading(points_m)], config.max_cloud_points)
     if len(readings_m) == 0:
-        return Refusal(status="too few points", reason=_explain_emptiness(pose_input))
+        raise Refused("too few points", _explain_emptiness(pose_input))
 
-    # Those near their median, if they can be posed.
+    # Those near their median that a camera can see. In a wrong unit nearly all seem to be flying
+    # pixels, and few readings do not say whether the unit or the frame is another.
     cloud_m = _drop_flying_pixels(readings_m, model.diameter_m, cloud_config)
-    refusal = _refuse_unposable(pose_input, readings_m, cloud_m, model, cloud_config)
-    if refusal is not None:
-        return refusal
+    cloud_m = cloud_m[_is_before_camera(cloud_m)]
+    require_points(readings_m, cloud_config)
+    _require_frame_and_unit(pose_input, readings_m, cloud_m, model)
+    require_points(cloud_m, cloud_config)
+    _require_extent(pose_input, cloud_m, model)
     return ObjectCloud(name=pose_input.name, cloud_m=cloud_m, view=view, is_masked=is_masked)
 
 
@@ -104,35 +114,16 @@ def why_nothing_seen(view: ViewInput) -> str:
     return f"none of the {masked} masked pixels has a depth reading"
 
 
-def _refuse_unposable(
-    pose_input: CloudInput | ViewInput,
-    readings_m: Float[Tensor, "n 3"],
-    cloud_m: Float[Tensor, "m 3"],
-    model: ObjectModel,
-    cloud_config: CloudConfig,
-) -> Refusal | None:
-    """Refuse a cloud that cannot be posed, by its size, place and shape; None where it can.
-
-    ``readings_m`` are all readings in the mask, ``cloud_m`` those without flying pixels.
-    """
-    # First of all readings: few of them do not say whether the unit or the frame is another.
-    too_few = why_too_few(readings_m, cloud_config)
-    if too_few is not None:
-        return Refusal(status="too few points", reason=too_few)
-    unusable = _explain_other_frame_or_unit(pose_input, readings_m, cloud_m, model)
-    if unusable is not None:
-        return Refusal(status="unusable input", reason=unusable)
-    # Then without flying pixels: in a wrong unit nearly all seem to be such, so it is asked last.
-    too_few = why_too_few(cloud_m, cloud_config)
-    if too_few is not None:
-        return Refusal(status="too few points", reason=too_few)
-
+def _require_extent(
+    pose_input: CloudInput | ViewInput, cloud_m: Float[Tensor, "m 3"], model: ObjectModel
+) -> None:
+    """Raise :class:`Refused` where a cloud has no extent along an axis."""
     # A plane or a line can slide within itself: in how many directions has the cloud no extent?
     centred = cloud_m.double() - cloud_m.double().mean(0)
     extent_m = torch.linalg.eigvalsh(centred.T @ centred / len(centred)).clamp(min=0).sqrt()
     flat_axes = int((extent_m < _FLAT_DIAMETERS * model.diameter_m).sum())
     if flat_axes == 0:
-        return None
+        return
     shape = {1: "in a plane", 2: "on a line", 3: "in one place"}[flat_axes]
     reason = (
         f"the points lie {shape}, so that motions along it change nothing that is seen; look from "
@@ -140,18 +131,18 @@ def _refuse_unposable(
     )
     if isinstance(pose_input, ViewInput) and flat_axes == 1:
         reason += ", or give the mask of this image: this one may lie on the background"
-    return Refusal(status="not observable", reason=reason)
+    raise Refused("not observable", reason)
 
 
-def _explain_other_frame_or_unit(
+def _require_frame_and_unit(
     pose_input: CloudInput | ViewInput,
     readings_m: Float[Tensor, "n 3"],
     cloud_m: Float[Tensor, "m 3"],
     model: ObjectModel,
-) -> str | None:
-    """Explain that a cloud is in another frame or unit than camera and model; None where it is not.
+) -> None:
+    """Raise :class:`Refused` where a cloud is in another frame or unit than camera and model.
 
-    ``readings_m`` are all readings in the mask, ``cloud_m`` those without flying pixels.
+    ``readings_m`` are all readings in the mask, ``cloud_m`` those that are used.
     """
     # The size is measured without flying pixels, if those are few.
     has_few_flying = len(cloud_m) > _MAJORITY * len(readings_m)
@@ -163,20 +154,29 @@ def _explain_other_frame_or_unit(
     nearest_m = float(depth_m.quantile(0.05))  # 1 - _NEARLY_ALL
     is_centred = is_about_origin and nearest_m < _LEAST_DEPTH_DIAMETERS * model.diameter_m
     if isinstance(pose_input, CloudInput) and is_centred and size_advice is None:
-        return (
+        raise Refused(
+            "unusable input",
             "the cloud lies about the origin, where the camera is: it was centred, or is in "
-            "the frame of the model; give it in the camera's frame, as it was seen"
+            "the frame of the model; give it in the camera's frame, as it was seen",
         )
     axes_advice = advise_frame(readings_m)
     if axes_advice is not None:
-        return axes_advice
-    if size_advice is None:
-        return None
+        raise Refused("unusable input", axes_advice)
+
     # Some background in the mask makes a cloud larger, and does not mean another unit.
-    if has_few_flying and size_advice.is_cloud_larger:
-        return None
-    hint = _hint_at_size_mistakes(pose_input.mask) if isinstance(pose_input, ViewInput) else ""
-    return f"{size_advice.message} (the object is {model.diameter_m:.3g} m long{hint})"
+    if size_advice is not None and not (has_few_flying and size_advice.is_cloud_larger):
+        hint = _hint_at_size_mistakes(pose_input.mask) if isinstance(pose_input, ViewInput) else ""
+        raise Refused(
+            "unusable input",
+            f"{size_advice.message} (the object is {model.diameter_m:.3g} m long{hint})",
+        )
+    unseen_share = float((~_is_before_camera(readings_m)).float().mean())
+    if unseen_share > 1 - _NEARLY_ALL:
+        raise Refused(
+            "unusable input",
+            f"{unseen_share:.0%} of the points lie behind the camera or beside it, where it sees "
+            f"none: are they another sensor's? {OTHER_FRAME}",
+        )
 
 
 def _hint_at_size_mistakes(mask: Bool[Tensor, "h w"]) -> str:
@@ -211,8 +211,7 @@ def cloud_from_depth(
     Raises:
         InputError: mask and depth differ in size.
     """
-    if depth_m.shape != mask.shape:
-        raise make_size_error(mask, depth_m)
+    require_same_size(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
 
     # depth * K^-1 (u, v, 1), as ``back_project`` computes it of a whole image.
@@ -244,14 +243,13 @@ def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> Clo
     return CloudSample(input=cloud, truth=view.truth)
 
 
-def make_size_error(
-    mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]
-) -> InputError:
-    """Build the error that a mask and a depth image differ in size."""
-    return InputError(
-        f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
-        f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
-    )
+def require_same_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> None:
+    """Raise an :class:`InputError` where a mask and a depth image differ in size."""
+    if mask.shape != depth_m.shape:
+        raise InputError(
+            f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
+            f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
+        )
 
 
 def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:
@@ -270,6 +268,12 @@ def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:
     return grown if grow_px >= 0 else ~grown
 
 
+def _is_before_camera(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Mark the points of the camera frame that a camera can see: before it, and not far aside."""
+    aside_m = points_m[:, :2].abs().amax(-1)
+    return points_m[:, 2] > aside_m / _STEEPEST_TANGENT
+
+
 def is_reading(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
     """Mark the points of a cloud that were measured.
 
@@ -278,15 +282,15 @@ def is_reading(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
     return (points_m.abs() < _FARTHEST_M).all(-1) & (points_m != 0).any(-1)
 
 
-def why_too_few(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = None) -> str | None:
-    """Explain that a cloud has fewer than ``config.min_points`` points; None where it has not."""
+def require_points(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = None) -> None:
+    """Raise :class:`Refused` where a cloud has fewer than ``config.min_points`` points."""
     config = CloudConfig() if config is None else config
-    if len(points_m) >= config.min_points:
-        return None
-    return (
-        f"the cloud has {len(points_m)} points, fewer than the {config.min_points} that a pose "
-        "takes: is the mask empty, or the depth missing there?"
-    )
+    if len(points_m) < config.min_points:
+        raise Refused(
+            "too few points",
+            f"the cloud has {len(points_m)} points, fewer than the {config.min_points} that a pose "
+            "takes: is the mask empty, or the depth missing there?",
+        )
 
 
 _UNITS_PER_METRE = {"mm": 1000.0, "cm": 100.0, "inches": 39.37}

@@ -1,19 +1,25 @@
 """What every estimator of poses offers: one object, several, whole depth images, sequences."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import ClassVar
 
 import torch
 from tqdm import tqdm
 
 from depthpose.core.camera import AnyCamera, choose_lens
-from depthpose.core.devices import force_float32, iterate_in_float32, map_in_threads
-from depthpose.core.errors import InputError, describe_full_memory, suggest_name
+from depthpose.core.devices import (
+    force_float32,
+    iterate_in_float32,
+    map_in_threads,
+    refused_memory,
+)
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import AnyPicture
 from depthpose.core.rigid import Rigid
+from depthpose.core.stopwatch import Stopwatch
 from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, add_background
 from depthpose.pose.color_inputs import add_color
@@ -32,14 +38,15 @@ from depthpose.pose.inputs import (
     view_input,
 )
 from depthpose.pose.pipeline import register
+from depthpose.pose.refusals import answer, unreadable_on_error
 from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.track import TrackedObject, track
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
-from depthpose.pose.verify.decide import choose_object, refused, seconds_of_all
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.verify.decide import choose_object, seconds_of_all
 from depthpose.pose.verify.prepared_object import PreparedObject
 from depthpose.pose.verify.probability import PRIOR_EXPECTED, PRIOR_PROPOSED
 
-Result = TypeVar("Result")
+NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 _NAME = "input"  # what an input is called that came without a name
 
 
@@ -90,38 +97,35 @@ class PoseEstimator:
         if isinstance(inputs, AnyInput):
             raise InputError("estimate_many takes several inputs; give one as [input]")
         total = len(inputs) if isinstance(inputs, Sized) else None
-        estimates = self._estimate_each(inputs, threads)
+        estimates = self._estimate_each(map(_require_input, inputs), threads)
         return list(tqdm(estimates, total=total, unit=" poses", disable=not with_progress))
 
-    def _estimate_each(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool = True
-    ) -> Iterator[PoseEstimate]:
-        """Estimate each input, in order.
+    def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
+        """Estimate each input, in order; one that cannot be taken at all is ``unreadable``.
 
         Args:
             inputs: clouds and views.
             threads: how many inputs are estimated at the same time.
-            is_expected: whether the inputs are meant to show their objects. Else they are tries of
-                objects that may well not be there, and the evidence decides which are.
         """
-        del is_expected  # a model alone is tried as it is expected
-        return map_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
 
-    def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
-        """Estimate one input; an estimator of many at once has its own :meth:`_estimate_each`."""
+        def estimate(pose_input: AnyInput) -> PoseEstimate:
+            """Estimate one of them."""
+            return unreadable_on_error(pose_input, partial(self._estimate, pose_input))
+
+        return map_in_threads(estimate, inputs, threads)
+
+    def _estimate(self, pose_input: AnyInput, *, is_expected: bool = True) -> PoseEstimate:
+        """Estimate one input.
+
+        Args:
+            pose_input: a cloud or a view.
+            is_expected: whether the input is meant to show its object. Else it is a try of an
+                object that may well not be there, and the evidence decides whether it is.
+
+        Raises:
+            InputError: it cannot be taken at all.
+        """
         raise NotImplementedError
-
-    @torch.no_grad()
-    @force_float32()
-    def _estimate_or_raise(
-        self, inputs: Sequence[AnyInput], *, is_expected: bool
-    ) -> list[PoseEstimate]:
-        """Estimate inputs as :meth:`_estimate_each` does; raise the error of one it cannot take."""
-        estimates = list(self._estimate_each(inputs, 1, is_expected=is_expected))
-        for estimate in estimates:
-            if estimate.status == "unreadable":
-                raise InputError(estimate.reason)
-        return estimates
 
     def _register_or_search(self, pose_input: AnyInput) -> PoseEstimate:
         """Register one object to the points of its mask, or search it in the mask as in a box.
@@ -131,7 +135,9 @@ class PoseEstimator:
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
         prepared = self._find_object(pose_input.object).prepare()
-        estimate = register(pose_input, prepared, self.config, self.refusal)
+        watch = Stopwatch()
+        work = partial(register, pose_input, prepared, self.config, self.refusal, watch)
+        estimate = answer(pose_input, watch, work)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
 
@@ -149,7 +155,13 @@ class PoseEstimator:
     def _targets(
         self, names: Sequence[str], *, prior_odds: float = PRIOR_PROPOSED, is_single: bool = False
     ) -> SearchTargets:
-        """Prepare objects for a search; arguments as in :class:`SearchTargets`."""
+        """Prepare objects for a search; arguments as in :class:`SearchTargets`.
+
+        Raises:
+            InputError: an unknown object, or this estimator cannot search.
+        """
+        if self.needs_mask:
+            raise InputError(NEEDS_MASK)
         return SearchTargets(
             objects={name: self._find_object(name).prepare() for name in names},
             config=self.config,
@@ -158,6 +170,7 @@ class PoseEstimator:
             is_single=is_single,
         )
 
+    @torch.no_grad()
     @force_float32()
     def estimate(  # noqa: PLR0913  every form of input
         self,
@@ -232,10 +245,11 @@ class PoseEstimator:
             pose_input = add_color(pose_input, models, color, color_camera, color_from_depth)
 
         # Of one object, or of whichever fits best.
-        if object is not None or len(self.models) == 1:
-            return self._estimate_or_raise([pose_input], is_expected=True)[0]
-        tried = [replace(pose_input, object=name) for name in self.objects]
-        estimates = self._estimate_or_raise(tried, is_expected=False)
+        with refused_memory(_NAME):
+            if object is not None or len(self.models) == 1:
+                return self._estimate(pose_input)
+            tried = [replace(pose_input, object=name) for name in self.objects]
+            estimates = [self._estimate(one, is_expected=False) for one in tried]
         return choose_object(estimates, self.config.min_certainty)
 
     @force_float32()
@@ -308,10 +322,8 @@ class PoseEstimator:
             if asked is None
             else [self._find_object(name).model.name for name in asked]
         )
-        if not names:
-            raise InputError("find: objects names none; give those that may be there, or omit it")
         # A view names one object, which a search does not read.
-        view = view_input(depth, None, camera, names[0], _NAME, unit)
+        view = view_input(depth, None, camera, self.objects[0], _NAME, unit)
         view = add_background(view, background, camera, unit)
         return [estimate for estimate in self.find_in(view, names) if estimate.is_posed]
 
@@ -325,7 +337,12 @@ class PoseEstimator:
         Args:
             view: depth and camera.
             objects: which may be there.
+
+        Raises:
+            InputError: an unknown object, or none.
         """
+        if not objects:
+            raise InputError("find: objects names none; give those that may be there, or omit it")
         return find_objects(view, self._targets(objects))
 
     def track(
@@ -392,12 +409,18 @@ class PoseEstimator:
         """Do as :meth:`track` does for views and clouds; in a view only its mask is searched.
 
         In place of a frame that cannot be read there is an estimate that says so.
-        """
 
+        Raises:
+            InputError: an unknown object, or an estimator that cannot search without a ``first``.
+        """
+        if self.needs_mask and first is None:
+            raise InputError(NEEDS_MASK)
+
+        @torch.no_grad()
         def search(pose_input: AnyInput) -> PoseEstimate:
             """Pose the object in a frame without a pose of the frame before."""
             if isinstance(pose_input, CloudInput):
-                return self._estimate_or_raise([pose_input], is_expected=False)[0]
+                return self._estimate(pose_input, is_expected=False)
             return find_objects(pose_input, self._targets([object], is_single=True))[0]
 
         prepared = self._find_object(object)
@@ -450,21 +473,11 @@ class PoseEstimator:
         return self._prepared_objects[name]
 
 
-def unreadable_on_error(
-    work: Callable[[AnyInput], Result], pose_input: AnyInput
-) -> Result | PoseEstimate:
-    """Do work on an input; return a refusal in place of an error that the input causes."""
+def _require_input(pose_input: AnyInput) -> AnyInput:
+    """Return an input; raise an :class:`InputError` where it is something else."""
     if not isinstance(pose_input, AnyInput):
         raise InputError(
             "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a "
             f"{type(pose_input).__name__}; files and arrays go to estimate(), one at a time"
         )
-    try:
-        return work(pose_input)
-    except InputError as error:
-        reason = str(error)
-    except (MemoryError, RuntimeError) as error:
-        if (message := describe_full_memory(error)) is None:
-            raise
-        reason = f"{pose_input.name}: {message}"
-    return refused(pose_input, Refusal(status="unreadable", reason=reason), {})
+    return pose_input

@@ -107,7 +107,8 @@ def depth_input(
                 "are metres unless a unit is given"
             )
         values = values.double()
-    depth_m = torch.where(values > 0, values * (unit_m or 1.0), torch.nan).float()
+    is_read = (values > 0) & values.isfinite()  # ROS writes +inf where a surface is out of range
+    depth_m = torch.where(is_read, values * (unit_m or 1.0), torch.nan).float()
     return depth_m, its_camera
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -25,24 +25,23 @@ from depthpose.core.devices import (
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
-from depthpose.pose.cloud import ObjectCloud, cloud_from_depth, prepare_cloud, why_too_few
+from depthpose.pose.cloud import ObjectCloud, cloud_from_depth, prepare_cloud, require_points
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
+from depthpose.pose.estimator import NEEDS_MASK, PoseEstimator
 from depthpose.pose.geometry.grid import VoxelGrid, sample_and_voxelise
 from depthpose.pose.icp import refine_best, rotate_starts
 from depthpose.pose.networks.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
 from depthpose.pose.pipeline import judge, propose_by_pairs
 from depthpose.pose.propose import fit_poses, meet_lines, vote_ransac
+from depthpose.pose.refusals import Refused, answer, unreadable_on_error
 from depthpose.pose.types import (
     AnyInput,
     PoseEstimate,
-    Refusal,
     Status,
     ViewInput,
     Vote,
     VotingPoints,
 )
-from depthpose.pose.verify.decide import refused
 from depthpose.pose.verify.observability import free_motions, without_motions
 from depthpose.pose.verify.prepared_object import PreparedObject, has_surface, require_surface
 from depthpose.pose.verify.probability import PRIOR_EXPECTED, PRIOR_PROPOSED
@@ -51,7 +50,6 @@ from depthpose.pose.weights import PoseWeights, read_pose_weights
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
 """Statuses for which another method may find the pose; the others are due to the input."""
 _COMPARED = 100  # points at which the best of symmetric copies is chosen
-_NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 
 
 class VotingDirections(NamedTuple):
@@ -70,6 +68,7 @@ class CloudToPose:
     cloud: ObjectCloud  #: all points of the object
     voxels: VoxelGrid  #: with the points that the network sees and that vote, one for each voxel
     watch: Stopwatch  #: of the stages so far
+    is_expected: bool  #: whether the input is meant to show the object
     #: of the network at each voting point, in the camera frame; empty before it is run.
     directions: Float[Tensor, "n k 3"] = field(default_factory=lambda: torch.empty(0, 0, 3))
 
@@ -160,19 +159,31 @@ class GeoPoseNet(PoseEstimator):
         kind = type(self._network).__name__
         return f"GeoPoseNet({kind} of {objects}{weights}, {self.config.device})"
 
-    def _estimate_each(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool = True
-    ) -> Iterator[PoseEstimate]:
-        """Run the network on several clouds together, and pose each by its votes.
+    def _estimate(self, pose_input: AnyInput, *, is_expected: bool = True) -> PoseEstimate:
+        """Prepare the cloud of an input, run the network on it, and pose it by its votes."""
+        job = self._prepare(pose_input, is_expected=is_expected)
+        self._run_network([job])
+        return self._pose_or_register(job)
+
+    def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
+        """Do as :meth:`_estimate` does, with one run of the network for several clouds.
 
         The pose of an input does not depend on those beside it, but for the rounding of the
-        network's sums. Where the config says so, what the votes leave in doubt is registered, but
-        no try; the prior odds of a try are those of a search's proposals.
+        network's sums.
         """
-        prepare = partial(self._prepare, is_expected=is_expected)
-        prepared = map_in_threads(partial(unreadable_on_error, prepare), inputs, threads)
-        pose = partial(self._pose_or_register, is_expected=is_expected)
-        for group in _group_by_voxels(prepared, self.config.batch_voxels):
+
+        def prepare(pose_input: AnyInput) -> CloudToPose | PoseEstimate:
+            """Prepare the cloud of one input."""
+            return unreadable_on_error(pose_input, partial(self._prepare, pose_input))
+
+        def pose(job: CloudToPose | PoseEstimate) -> PoseEstimate:
+            """Pose one cloud."""
+            if isinstance(job, PoseEstimate):
+                return job
+            return unreadable_on_error(job.pose_input, partial(self._pose_or_register, job))
+
+        jobs = map_in_threads(prepare, inputs, threads)
+        for group in _group_by_voxels(jobs, self.config.batch_voxels):
             self._run_network(group)
             yield from map_in_threads(pose, group, threads)
 
@@ -191,14 +202,16 @@ class GeoPoseNet(PoseEstimator):
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
         with refused_memory(pose_input.name):
-            job = self._prepare(pose_input, is_expected=True)
+            job = self._prepare(pose_input)
             if isinstance(job, PoseEstimate):
                 return job, None
             self._run_network([job])
-            voted = self._estimate_by_votes(pose_input, job=job, is_expected=True)
+            voted = answer(pose_input, job.watch, partial(self._estimate_by_votes, job))
             return voted, VotingDirections(job.voxels.points_m, job.directions)
 
-    def _prepare(self, pose_input: AnyInput, *, is_expected: bool) -> CloudToPose | PoseEstimate:
+    def _prepare(
+        self, pose_input: AnyInput, *, is_expected: bool = True
+    ) -> CloudToPose | PoseEstimate:
         """Lift an input to the cloud and the voxels that the network takes.
 
         For a region, or an input that is refused, the finished estimate is returned instead. The
@@ -210,16 +223,23 @@ class GeoPoseNet(PoseEstimator):
         # Now, so that the time of no stage includes it.
         _ = prepared.prepare() if is_expected else prepared.copies
         watch = Stopwatch()
-        with watch.stage("cloud"):
-            cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
-        if isinstance(cloud, Refusal):
-            return refused(pose_input, cloud, watch.seconds)
-        with watch.stage("cloud"):
-            seed = self.config.voting.seed
-            voxels = sample_and_voxelise(cloud.cloud_m, self.weights.cloud, seed)
-        return CloudToPose(
-            pose_input=pose_input, prepared=prepared, cloud=cloud, voxels=voxels, watch=watch
-        )
+
+        def lift() -> CloudToPose:
+            """Lift it to the points of the object, and these to voxels."""
+            with watch.stage("cloud"):
+                cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
+                seed = self.config.voting.seed
+                voxels = sample_and_voxelise(cloud.cloud_m, self.weights.cloud, seed)
+            return CloudToPose(
+                pose_input=pose_input,
+                prepared=prepared,
+                cloud=cloud,
+                voxels=voxels,
+                watch=watch,
+                is_expected=is_expected,
+            )
+
+        return answer(pose_input, watch, lift)
 
     def _run_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
         """Run the network once on all clouds of a group, and set their ``directions``."""
@@ -249,37 +269,32 @@ class GeoPoseNet(PoseEstimator):
             job.directions = directions @ job.voxels.grid_from_camera
             job.watch.seconds["network"] = watch.seconds["network"] * count / sum(counts)
 
-    def _pose_or_register(
-        self, job: CloudToPose | PoseEstimate, *, is_expected: bool
-    ) -> PoseEstimate:
+    def _pose_or_register(self, job: CloudToPose | PoseEstimate) -> PoseEstimate:
         """Pose a cloud by its votes, or by registration where these are doubted.
 
-        Only an input that is expected to show its object is registered. An estimate stays as it is.
+        It is registered if the config says so and the input is expected to show its object. An
+        estimate stays as it is.
         """
         if isinstance(job, PoseEstimate):
             return job
-        voted = unreadable_on_error(
-            partial(self._estimate_by_votes, job=job, is_expected=is_expected), job.pose_input
-        )
-        is_registered = self.config.register_refused and is_expected and voted.status in _DOUBTED
-        if not is_registered:
+        voted = answer(job.pose_input, job.watch, partial(self._estimate_by_votes, job))
+        may_register = self.config.register_refused and job.is_expected
+        if not may_register or voted.status not in _DOUBTED:
             return voted
         watch = Stopwatch()
         with watch.stage("registration"):
-            registered = unreadable_on_error(self._register_or_search, job.pose_input)
+            registered = self._register_or_search(job.pose_input)
         best = registered if registered.is_posed else voted
         return replace(best, seconds={**voted.seconds, **watch.seconds})
 
-    def _estimate_by_votes(
-        self, pose_input: AnyInput, *, job: CloudToPose, is_expected: bool
-    ) -> PoseEstimate:
+    def _estimate_by_votes(self, job: CloudToPose) -> PoseEstimate:
         """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence.
 
         Args:
-            pose_input: for the names of a refusal.
-            job: its cloud, with directions.
-            is_expected: whether the input is meant to show its object: then the prior odds are
-                higher.
+            job: a cloud with directions.
+
+        Raises:
+            Refused: the votes or the evidence do not allow a pose.
         """
         config = self.config
         prepared = job.prepared
@@ -289,8 +304,6 @@ class GeoPoseNet(PoseEstimator):
         with watch.stage("proposal"):
             vote = self._vote(job)
             fits = fit_poses(vote, prepared.model, config)
-        if isinstance(fits, Refusal):
-            return refused(pose_input, fits, watch.seconds)
 
         # Refine; where ICP brings no point near the model, the fit of the keypoints stays.
         poses = fits.camera_from_model.double()
@@ -307,28 +320,32 @@ class GeoPoseNet(PoseEstimator):
 
         # Where little of a part is visible, all votes may mean the wrong end of it. Poses that
         # point pairs propose compete with the one that was voted for.
-        if config.with_icp and is_expected and has_surface(prepared.model):
+        if config.with_icp and job.is_expected and has_surface(prepared.model):
             with watch.stage("proposal"):
                 proposals = propose_by_pairs(job.cloud, prepared, config.voting.seed)
             others = Rigid.cat([others, proposals])
 
         # Compare, compete, decide.
-        estimate = judge(
-            job.cloud,
-            prepared,
-            refined,
-            others,
-            config,
-            self.weights.refusal,
-            watch,
-            prior_odds=PRIOR_EXPECTED if is_expected else PRIOR_PROPOSED,
-            votes_rad=partial(self._measure_disagreement, job),
-        )
-        return replace(
-            estimate,
-            keypoints_m=vote.keypoints_m.float(),
-            inlier_share=float(vote.inlier_share.mean()),
-        )
+        voted: dict[str, Any] = {
+            "keypoints_m": vote.keypoints_m.float(),
+            "inlier_share": float(vote.inlier_share.mean()),
+        }
+        try:
+            estimate = judge(
+                job.cloud,
+                prepared,
+                refined,
+                others,
+                config,
+                self.weights.refusal,
+                watch,
+                prior_odds=PRIOR_EXPECTED if job.is_expected else PRIOR_PROPOSED,
+                votes_rad=partial(self._measure_disagreement, job),
+            )
+        except Refused as refused:
+            measured = {**voted, **refused.measured}
+            raise Refused(refused.status, refused.reason, **measured) from refused
+        return replace(estimate, **voted)
 
     def _vote(self, job: CloudToPose) -> Vote:
         """Find the keypoints, in the camera frame, where the directions at the points meet."""
@@ -390,39 +407,43 @@ class DepthImageRegressor(PoseEstimator):
         self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._cloud = weights.cloud
 
-    def _estimate_or_raise(
-        self, inputs: Sequence[AnyInput], *, is_expected: bool
-    ) -> list[PoseEstimate]:
-        """Estimate one input; raise where several are given, one for each object that it may be."""
-        if len(inputs) > 1:
-            names = ", ".join(item.object for item in inputs)
-            raise InputError(f"object: say which of {names}; a regressor refuses none")
-        return super()._estimate_or_raise(inputs, is_expected=is_expected)
-
-    def _targets(self, *_: object, **__: object) -> NoReturn:
-        """Refuse every search: a regressor cannot tell whether an object is there."""
-        raise InputError(_NEEDS_MASK)
-
-    def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
+    def _estimate(self, pose_input: AnyInput, *, is_expected: bool = True) -> PoseEstimate:
         """Regress the pose from a crop of the depth image, and refine it by ICP."""
         prepared = self._find_object(pose_input.object)
         if not isinstance(pose_input, ViewInput):
-            raise InputError(_NEEDS_MASK)
+            raise InputError(NEEDS_MASK)
         # An empty region means that nothing was detected: it is refused below for too few pixels.
         if pose_input.is_region and bool(pose_input.mask.any()):
-            raise InputError(_NEEDS_MASK)
+            raise InputError(NEEDS_MASK)
+        if not is_expected:
+            names = ", ".join(self.objects)
+            raise InputError(f"object: say which of {names}; a regressor refuses none")
+        watch = Stopwatch()
+        work = partial(self._regress, pose_input, prepared, watch)
+        return answer(pose_input, watch, work)
+
+    def _regress(
+        self, pose_input: ViewInput, prepared: PreparedObject, watch: Stopwatch
+    ) -> PoseEstimate:
+        """Regress the pose of one object, and refine it.
+
+        Args:
+            pose_input: a depth image with the mask of the object.
+            prepared: the object.
+            watch: to which the times of the stages are added.
+
+        Raises:
+            Refused: the mask has too few readings.
+        """
         config = self._network.config
         model = prepared.model
-        watch = Stopwatch()
 
         # The crop that the network sees, and the pose that it regresses.
         with watch.stage("network"):
             crop = cut_depth(pose_input, config, model.diameter_m)
         if crop is None:
             reason = f"fewer than {config.min_points} masked pixels have a depth"
-            return refused(
-                pose_input, Refusal(status="too few points", reason=reason), watch.seconds
-            )
+            raise Refused("too few points", reason)
         with watch.stage("network"):
             batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
             numbers = torch.tensor([prepared.number], device=self.config.device)
@@ -443,8 +464,7 @@ class DepthImageRegressor(PoseEstimator):
             points_m = cloud_from_depth(
                 pose_input.depth_m, pose_input.mask, pose_input.K, model.diameter_m, self._cloud
             ).float()
-        if (few := why_too_few(points_m, self._cloud)) is not None:
-            return replace(estimate, status="too few points", reason=few, camera_from_model=None)
+        require_points(points_m, self._cloud)
         with watch.stage("icp"):
             icp = self.config.icp
             rotated = rotate_starts(pose[None].double(), prepared.surface, icp.starts)

@@ -18,8 +18,9 @@ from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.geometry.grid import fit_local_planes, thin_cloud
 from depthpose.pose.icp import refine_best
 from depthpose.pose.propose.point_pairs import propose_poses
-from depthpose.pose.types import AnyInput, PoseEstimate, PoseFit, Refusal
-from depthpose.pose.verify.decide import decide, refused
+from depthpose.pose.refusals import Refused
+from depthpose.pose.types import AnyInput, PoseEstimate, PoseFit
+from depthpose.pose.verify.decide import decide
 from depthpose.pose.verify.evidence import observe
 from depthpose.pose.verify.hypotheses import compete
 from depthpose.pose.verify.prepared_object import PreparedObject
@@ -35,6 +36,7 @@ def register(
     prepared: PreparedObject,
     config: EstimateConfig,
     refusal: RefusalConfig,
+    watch: Stopwatch,
     *,
     proposals: Rigid | None = None,
     prior_odds: float = PRIOR_EXPECTED,
@@ -46,16 +48,17 @@ def register(
         prepared: the object.
         config: of ICP, and of what a real object is off from its model.
         refusal: when the estimate is withheld.
+        watch: to which the times of the stages are added.
         proposals: poses of a search; None: point pairs of the points propose.
         prior_odds: of the best pose being right, before its evidence is seen.
-    """
-    watch = Stopwatch()
 
+    Raises:
+        InputError: mask and depth differ in size.
+        Refused: the points do not allow a pose.
+    """
     # The usable points of the object.
     with watch.stage("cloud"):
         cloud = prepare_cloud(pose_input, prepared.model, CloudConfig(), config)
-    if isinstance(cloud, Refusal):
-        return refused(pose_input, cloud, watch.seconds)
 
     # Propose.
     with watch.stage("proposal"):
@@ -67,8 +70,10 @@ def register(
         cloud_m = cloud.cloud_m.double()
         refined, others = refine_best(cloud_m, proposals, prepared.surface, config.icp)
     if float(refined.inlier_share) == 0:
-        reason = "no pose brings the model near the points: another object, or too little of it"
-        return refused(pose_input, Refusal(status="no pose found", reason=reason), watch.seconds)
+        raise Refused(
+            "no pose found",
+            "no pose brings the model near the points: another object, or too little of it",
+        )
 
     # Compare, compete, decide.
     return judge(cloud, prepared, refined, others, config, refusal, watch, prior_odds=prior_odds)
@@ -108,6 +113,9 @@ def judge(
         watch: of the stages before, to which this one's are added.
         prior_odds: of the best pose being right, before its evidence is seen.
         votes_rad: angle between a network's directions and a pose, as :func:`compete` takes it.
+
+    Raises:
+        Refused: the best pose is not observable, doubtful, or of another object.
     """
     # The best pose against its near-symmetric copies, look-alikes and other local minima.
     with watch.stage("evidence"):

@@ -107,7 +107,12 @@ class Registration(PoseEstimator):
         for name in self.objects:
             self._find_object(name).prepare()
 
-    def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
+    def _estimate(
+        self,
+        pose_input: AnyInput,
+        *,
+        is_expected: bool = True,  # noqa: ARG002  a model alone is tried as it is expected
+    ) -> PoseEstimate:
         """Register one input, or search its region."""
         return self._register_or_search(pose_input)
 

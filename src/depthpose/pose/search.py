@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -20,7 +20,8 @@ from torch import Tensor
 
 from depthpose.core.devices import map_in_threads
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth, why_nothing_seen
+from depthpose.core.stopwatch import Stopwatch
+from depthpose.pose.cloud import cloud_from_depth, require_same_size, why_nothing_seen
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.footprint import crop_to_region, explained_frame_mask, why_background_excludes
 from depthpose.pose.frame import Frame, prepare_frame
@@ -28,6 +29,7 @@ from depthpose.pose.icp import refine_roughly
 from depthpose.pose.picking import rank_picks
 from depthpose.pose.pipeline import register
 from depthpose.pose.propose.image import propose_in_frame
+from depthpose.pose.refusals import answer
 from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
 from depthpose.pose.verify.decide import (
     LEAST_SHARE,
@@ -126,7 +128,12 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     Args:
         view: depth and camera; only its mask is searched.
         targets: what for.
+
+    Raises:
+        InputError: mask and depth differ in size.
     """
+    require_same_size(view.mask, view.depth_m)
+
     # The part of the image that is searched, its normals and its background.
     began = time.perf_counter()
     region = crop_to_region(view)
@@ -308,14 +315,18 @@ def _judge(
             view=view,
             is_masked=False,
         )
-        return register(
+        watch = Stopwatch()
+        work = partial(
+            register,
             cloud,
             targets.objects[leader.object],
             targets.config,
             targets.refusal,
+            watch,
             proposals=Rigid.stack([place.pose for place in group]),
             prior_odds=targets.prior_odds,
         )
+        return answer(cloud, watch, work)
 
     judged: list[_JudgedPlace] = []
     misses: list[_Miss] = []

@@ -6,6 +6,7 @@ As long as the frames agree with the refined poses, a frame costs no more than I
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -16,21 +17,21 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.camera.pinhole import crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import cloud_from_depth, require_same_size
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.geometry.surface import NEAR, Surface
 from depthpose.pose.icp import refine_best
+from depthpose.pose.refusals import Refused, unreadable_on_error
 from depthpose.pose.types import (
     Alternative,
     AnyInput,
     CloudInput,
     Evidence,
     PoseEstimate,
-    Refusal,
     ViewInput,
 )
-from depthpose.pose.verify.decide import explain_doubt, why_not_observable, with_status
+from depthpose.pose.verify.decide import require_observable, require_right, with_status
 from depthpose.pose.verify.evidence import compare, observe
 from depthpose.pose.verify.observability import free_motions, without_motions
 from depthpose.pose.verify.prepared_object import PreparedObject
@@ -88,7 +89,7 @@ def _gather_scene(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float
 def _lift_square_about(
     view: ViewInput, middle_m: Float64[Tensor, "3"], radius_m: float
 ) -> Float64[Tensor, "n 3"]:
-    """Lift the masked pixels in a square about a ball to points of the camera frame."""
+    """Lift the foreground in a square about a ball to points of the camera frame."""
     # The square in the image.
     z_m = float(middle_m[2])
     K = view.K.double()
@@ -104,7 +105,7 @@ def _lift_square_about(
 
     window = (slice(top, bottom), slice(left, right))
     window_K = crop_intrinsics(K, left, top)
-    return cloud_from_depth(view.depth_m[window], view.mask[window], window_K).double()
+    return cloud_from_depth(view.depth_m[window], view.foreground[window], window_K).double()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -156,7 +157,8 @@ def track(
         first: its rough pose ``camera_from_model`` in the first frame; None: it is searched.
 
     Yields:
-        An estimate for each frame, whose ``tracking`` says how it came about.
+        An estimate for each frame, whose ``tracking`` says how it came about. A frame that cannot
+        be taken, as a mask of another size, is ``unreadable``.
     """
     current = None
     if first is not None:
@@ -166,7 +168,12 @@ def track(
         if isinstance(pose_input, PoseEstimate):
             yield pose_input
             continue
-        estimate, following = _follow_or_search(pose_input, current, target)
+        work = partial(_follow_or_search, pose_input, current, target)
+        outcome = unreadable_on_error(pose_input, work)
+        if isinstance(outcome, PoseEstimate):
+            yield outcome
+            continue
+        estimate, following = outcome
         # In a cloud without its depth image a lost object is looked for only where it was. It did
         # not go on as it moved before, or it would have been found there.
         is_bare_cloud = isinstance(pose_input, CloudInput) and pose_input.view is None
@@ -183,14 +190,22 @@ def _follow_or_search(
 
     Returns:
         The estimate, and the track after this frame; None for it where the object is lost.
+
+    Raises:
+        InputError: mask and depth of the frame differ in size.
     """
+    if isinstance(pose_input, ViewInput):
+        require_same_size(pose_input.mask, pose_input.depth_m)
+
     # Followed from the frame before.
     watch = Stopwatch()
     if current is not None:
-        with watch.stage("tracking"):
-            followed = _follow(pose_input, current, target)
-        if not isinstance(followed, Refusal):
-            estimate, following = followed
+        try:
+            with watch.stage("tracking"):
+                estimate, following = _follow(pose_input, current, target)
+        except Refused:  # searched below
+            pass
+        else:
             return replace(estimate, name=pose_input.name, seconds=watch.seconds), following
 
     # Searched: not known from the frame before, or not seen where it was.
@@ -213,12 +228,14 @@ def _follow_or_search(
 
 def _follow(
     pose_input: AnyInput, current: _Track, target: TrackedObject
-) -> tuple[PoseEstimate, _Track] | Refusal:
+) -> tuple[PoseEstimate, _Track]:
     """Refine the last pose and the predicted one, and weigh the better one by the evidence.
 
     Returns:
-        The estimate, still without a name, and the track after this frame; a refusal where the
-        object is not followed.
+        The estimate, still without a name, and the track after this frame.
+
+    Raises:
+        Refused: the object is not followed.
     """
     # Where it may be: at its last pose, or going on as it moved last.
     surface = target.prepared.surface
@@ -233,31 +250,21 @@ def _follow(
     is_support = _mark_support(scene_m, is_near, current.pose.apply(surface.points_m))
     cloud_m = scene_m[is_near & ~is_support]
     if len(cloud_m) < _LEAST_POINTS:
-        return Refusal(
-            status="too few points",
-            reason=f"{len(cloud_m)} points lie where the object was, below {_LEAST_POINTS}",
-        )
+        reason = f"{len(cloud_m)} points lie where the object was, below {_LEAST_POINTS}"
+        raise Refused("too few points", reason)
 
     # Refined, and the points that lie on it then.
     refined, _ = refine_best(cloud_m, poses, surface, target.config.icp)
     pose = refined.camera_from_model.double()
     object_m = scene_m[_mark_near(scene_m, pose[None], surface, NEAR) & ~is_support]
     if len(object_m) < _LEAST_POINTS:
-        return Refusal(
-            status="too few points",
-            reason=f"{len(object_m)} points lie on the object, below {_LEAST_POINTS}",
-        )
+        reason = f"{len(object_m)} points lie on the object, below {_LEAST_POINTS}"
+        raise Refused("too few points", reason)
 
     # Is the pose right, and does what is seen of the object determine it?
     weighed = _weigh_pose(pose_input, object_m, pose, current.log_odds, target)
-    if isinstance(weighed, Refusal):
-        return weighed
     free = free_motions(target.prepared.model.symmetries.continuous, pose)
-    not_observable = why_not_observable(
-        object_m, target.prepared, pose, free, target.refusal.min_observability
-    )
-    if not_observable is not None:
-        return not_observable
+    require_observable(object_m, target.prepared, pose, free, target.refusal.min_observability)
 
     # The estimate, and the track that the next frame begins with.
     estimate = PoseEstimate(
@@ -294,7 +301,7 @@ def _weigh_pose(
     pose: Rigid,
     log_odds: float,
     target: TrackedObject,
-) -> _WeighedPose | Refusal:
+) -> _WeighedPose:
     """Weigh a pose by the evidence of its frame, alone and together with the frames before.
 
     Args:
@@ -303,6 +310,9 @@ def _weigh_pose(
         pose: ``camera_from_model``.
         log_odds: that the track is right, by the frames before.
         target: the object.
+
+    Raises:
+        Refused: the pose is doubtful, by this frame or by all.
     """
     # By this frame alone.
     observation = observe(
@@ -313,9 +323,7 @@ def _weigh_pose(
     )
     evidence = compare(observation, pose, target.prepared.surface)
     probability = probability_right(evidence, PRIOR_EXPECTED)
-    if probability < target.refusal.min_probability:
-        reason = explain_doubt(evidence, probability, is_masked=False)
-        return Refusal(status="doubtful", reason=reason)
+    require_right(evidence, probability, target.refusal, is_masked=False)
 
     # Together with the frames before.
     log_odds += _NEW_EVIDENCE * log_likelihood_ratio(evidence)
@@ -326,7 +334,7 @@ def _weigh_pose(
             f"together with the frames before it the pose is right with a probability of "
             f"{certainty:.0%}, though by this frame alone with {probability:.0%}"
         )
-        return Refusal(status="doubtful", reason=reason)
+        raise Refused("doubtful", reason)
     return _WeighedPose(evidence, log_odds, certainty)
 
 

@@ -33,14 +33,6 @@ mirror image fits better than the sensor explains."""
 POSED: tuple[Status, ...] = ("ok", "ambiguous")  #: the statuses of an estimate with a pose
 
 
-@dataclass(frozen=True, kw_only=True)
-class Refusal:
-    """Why there is no pose."""
-
-    status: Status  #: the kind of refusal
-    reason: str  #: one sentence for people
-
-
 Tracking = Literal["tracked", "found", "lost"]
 """How an estimate of a sequence came about: followed from the frame before, found by a new search,
 or neither."""
@@ -121,6 +113,11 @@ class ViewInput:
     #: and is not the object is no evidence against a pose.
     is_region: bool = False
     background: KnownBackground | None = None  #: of this view; None: it is not known
+
+    @cached_property
+    def foreground(self) -> Bool[Tensor, "h w"]:
+        """The pixels of the mask whose readings do not lie on the known background."""
+        return self.mask if self.background is None else self.mask & ~self.background.is_seen
 
     @cached_property
     def shared_per_white(self) -> float:

@@ -18,7 +18,8 @@ from depthpose.pose.mesh import sample_surface
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.networks.resunet import ResUNet
 from depthpose.pose.networks.sparse import Voxels
-from depthpose.pose.types import AnyInput, ObjectModel, Refusal
+from depthpose.pose.refusals import Refused
+from depthpose.pose.types import AnyInput, ObjectModel
 
 _GAP_PX = 8
 """White space between the pictures of a grid."""
@@ -114,8 +115,9 @@ def compute_features(
     if not isinstance(network, ResUNet):
         raise InputError("figure 3-2 shows features of the sparse network; give weights of it")
     model = next(m for m in net.weights.models if m.name == pose_input.object)
-    cloud = prepare_cloud(pose_input, model, net.weights.cloud, net.config)
-    if isinstance(cloud, Refusal):
+    try:
+        cloud = prepare_cloud(pose_input, model, net.weights.cloud, net.config)
+    except Refused:
         return None
     grid = sample_and_voxelise(cloud.cloud_m, net.weights.cloud, net.config.voting.seed)
     coordinates = F.pad(grid.coordinates, (1, 0))  # all of cloud 0

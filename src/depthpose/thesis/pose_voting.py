@@ -14,7 +14,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth, why_too_few
+from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.geometry.grid import sample_points, voxelise
 from depthpose.pose.metrics import SUCCESS_SHARE, add_m, adds_m
@@ -76,7 +76,7 @@ def collect_votes(
         ).float()
         generator = torch.Generator().manual_seed(_SAMPLING_SEED)
         points_m = sample_points(cloud_m, max_points, generator)
-        if why_too_few(points_m, net.weights.cloud) is not None:
+        if len(points_m) < net.weights.cloud.min_points:
             yield None
             continue
 

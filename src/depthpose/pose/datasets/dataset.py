@@ -31,8 +31,8 @@ from depthpose.pose.cloud import (
     advise_unit,
     cloud_from_depth,
     grow_mask,
-    make_size_error,
-    why_too_few,
+    require_points,
+    require_same_size,
 )
 from depthpose.pose.datasets.layouts import (
     Instance,
@@ -51,6 +51,7 @@ from depthpose.pose.mesh import (
     symmetries_from_bop,
     symmetries_to_bop,
 )
+from depthpose.pose.refusals import Refused
 from depthpose.pose.types import ObjectModel, PoseTruth, ViewInput, ViewSample
 
 
@@ -101,8 +102,7 @@ class BopDataset:
         """
         mask = read_instance_mask(instance) if mask is None else mask
         depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
-        if mask.shape != depth_m.shape:
-            raise make_size_error(mask, depth_m)
+        require_same_size(mask, depth_m)
         return ViewSample(
             input=ViewInput(
                 name=instance.name,
@@ -357,10 +357,11 @@ def _compare_with_model(
     mask = read_mask(mask_path)
     depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
     cloud = cloud_from_depth(depth_m, mask, instance.K)
-    too_few = why_too_few(cloud)
-    if too_few is not None:
+    try:
+        require_points(cloud)
+    except Refused as refused:
         # Instances that are fully occluded are annotated too: no fault, but no test either.
-        yield Problem(path=mask_path, kind="note", message=too_few)
+        yield Problem(path=mask_path, kind="note", message=refused.reason)
         return
 
     # Do they lie at the annotated pose? And if so, does the posed model lie in the mask?

@@ -56,7 +56,7 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
             wide.
     """
     if len(points_m) == 0:
-        raise InputError("voxelise: the cloud has no point; see why_too_few first.")
+        raise InputError("voxelise: the cloud has no point; see require_points first.")
     if not bool(points_m.isfinite().all()):
         # One NaN would move the mean, and with it every point, into one cell.
         count = int((~points_m.isfinite().all(-1)).sum())

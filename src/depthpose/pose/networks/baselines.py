@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from depthpose.core.config import Settings
 from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import require_same_size
 from depthpose.pose.geometry.grid import rotation_from_z_to
 from depthpose.pose.networks.fcn import ResNet18
 from depthpose.pose.networks.sparse import RowNorm
@@ -89,7 +90,12 @@ def cut_depth(
         config: size, margin and contrast of the crop.
         diameter_m: of the object. Masked pixels whose depth differs by more from the median are
             left out; None: all are kept.
+
+    Raises:
+        InputError: mask and depth differ in size.
     """
+    require_same_size(view.mask, view.depth_m)
+
     # The pixels of the object.
     depth_m = torch.where(view.mask, view.depth_m, torch.nan)
     is_seen = depth_m.isfinite() & (depth_m > 0)

@@ -11,7 +11,8 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, rotation_by
 from depthpose.pose.config import EstimateConfig, VotingConfig
-from depthpose.pose.types import ObjectModel, PoseFit, Refusal, Vote
+from depthpose.pose.refusals import Refused
+from depthpose.pose.types import ObjectModel, PoseFit, Vote
 
 _SMALLEST = 1e-12  # length by which a vector is divided, or that a direction has
 _NEAREST = 0.1
@@ -391,7 +392,7 @@ _MOST_WEIGHT = 100  # times the median weight, in Kabsch's fit
 _MOST_SEVERITY = 100.0  # tolerances, of an error that decides which keypoint is removed
 
 
-def fit_poses(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
+def fit_poses(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit:
     """Fit a pose to the keypoints that are consistent; where ICP follows, also to all of them.
 
     Args:
@@ -400,15 +401,18 @@ def fit_poses(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit
         config: what keypoints must fulfil, and whether ICP follows.
 
     Returns:
-        A batch of one or two fits; or why there is none.
+        A batch of one or two fits.
+
+    Raises:
+        Refused: fewer than four keypoints are met by votes, or consistent.
     """
     # Keypoints at which the votes meet.
     is_met = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
     total = len(is_met)
     if int(is_met.sum()) < _LEAST_KEYPOINTS:
-        return Refusal(
-            status="votes do not meet",
-            reason=f"the directions meet at {int(is_met.sum())} of {total} keypoints, but "
+        raise Refused(
+            "votes do not meet",
+            f"the directions meet at {int(is_met.sum())} of {total} keypoints, but "
             f"{_LEAST_KEYPOINTS} are needed: too few points, or not the object that the mask "
             "promises",
         )
@@ -424,9 +428,9 @@ def fit_poses(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit
     if config.with_icp and not torch.equal(is_consistent, is_met):
         choices.append(is_met)
     if not choices:
-        return Refusal(
-            status="keypoints do not fit",
-            reason=f"{consistent} of {total} keypoints have the model's distances within "
+        raise Refused(
+            "keypoints do not fit",
+            f"{consistent} of {total} keypoints have the model's distances within "
             f"{limit_m:.2g} m, but {_LEAST_KEYPOINTS} are needed: another object, or too much of "
             "it occluded",
         )

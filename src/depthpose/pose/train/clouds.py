@@ -13,7 +13,7 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.loop import make_sample_generator, shuffle_index
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import lift_sample, why_too_few
+from depthpose.pose.cloud import lift_sample
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
@@ -159,7 +159,7 @@ class TrainingClouds(TrainingViews[PoseTraining]):
                 angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
                 if self._frames.with_roll:
                     sample = _roll_camera(sample, angle_rad)
-            if why_too_few(sample.input.points_m, cloud_config) is None:
+            if len(sample.input.points_m) >= cloud_config.min_points:
                 return voxelise_sample(sample, number, cloud_config, generator)
         raise InputError(
             f"sample {index}: {TRIES} samples in a row have fewer than "

@@ -29,7 +29,7 @@ from depthpose.core.loop import (
 )
 from depthpose.core.processes import find_rank
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import lift_sample, why_too_few
+from depthpose.pose.cloud import lift_sample
 from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
 from depthpose.pose.losses import direction_loss, model_point_loss
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
@@ -114,7 +114,7 @@ class PoseTask(ViewsTask):
         model = self.models[number]
         config = self.config.cloud
         sample = lift_sample(view, model.diameter_m, config)
-        if why_too_few(sample.input.points_m, config) is not None:
+        if len(sample.input.points_m) < config.min_points:
             return math.inf
         cloud = voxelise_sample(sample, number, config, generator)
 

@@ -32,7 +32,6 @@ _COPY_DIAMETERS = 0.05  # largest deviation of a near-symmetric copy; a look-ali
 _CLOSE_RAD = math.radians(45)  # largest angle between copies that follow each other about an axis
 _COMPARED = 100  # points of the model by which poses are compared
 _PARALLEL_COSINE = math.cos(math.radians(15))  # least cosine between axes that count as parallel
-_LEAST_POINTS = 500  # a model without faces and with fewer points has no surface
 _LONGER = 1.15
 """An axis is called long or short if its length and that of the middle axis have this ratio."""
 

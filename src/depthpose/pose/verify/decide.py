@@ -10,12 +10,13 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import ObjectCloud
+from depthpose.pose.cloud import OTHER_FRAME, ObjectCloud
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.types import Alternative, AnyInput, Evidence, PoseEstimate, Refusal
+from depthpose.pose.refusals import Refused
+from depthpose.pose.types import Alternative, Evidence, Identity, PoseEstimate
 from depthpose.pose.verify.copies import describe_difference
 from depthpose.pose.verify.evidence import Observation
-from depthpose.pose.verify.hypotheses import Competition
+from depthpose.pose.verify.hypotheses import Competition, Hypothesis
 from depthpose.pose.verify.identity import identify
 from depthpose.pose.verify.observability import free_motions, observability, without_motions
 from depthpose.pose.verify.prepared_object import PreparedObject
@@ -27,11 +28,6 @@ from depthpose.pose.verify.probability import (
     share_among_objects,
 )
 
-OTHER_FRAME = (
-    ". Or is the cloud not in the camera's frame (x right, y down, z forward)? A robot's base and "
-    "the world have z up: give it as the camera saw it"
-)
-"""What may be wrong with a cloud that fits no pose: its origin is not where the camera was."""
 _HIDDEN_WEIGHT = 0.5
 """Of an area that was not observed beside one that contradicts: it may only be hidden."""
 _LEAST_CONTRADICTING = LEAST_AREA / 4
@@ -52,7 +48,7 @@ def decide(
     config: EstimateConfig,
     prior_odds: float,
 ) -> PoseEstimate:
-    """Return the likeliest of competing poses as the estimate, or a refusal that says why not.
+    """Return the likeliest of competing poses as the estimate.
 
     Args:
         cloud: points of the object.
@@ -62,56 +58,44 @@ def decide(
         refusal: limits.
         config: settings of the estimate; without ICP size and mirror image are not tested.
         prior_odds: of the best pose being right, before its evidence is seen.
+
+    Raises:
+        Refused: it is not observable, doubtful, or of another object.
     """
     model = prepared.model
     best = competition.best
     probability = probability_right(best.evidence, prior_odds)
     free = free_motions(model.symmetries.continuous, best.pose)
 
-    # Does the view determine a pose, is it right, and is it of this object?
-    identity = None
-    withheld = why_not_observable(
-        cloud.cloud_m, prepared, best.pose, free, refusal.min_observability
-    )
-    if withheld is None and probability < refusal.min_probability:
-        doubt = explain_doubt(best.evidence, probability, is_masked=observation.is_masked)
-        withheld = Refusal(status="doubtful", reason=doubt)
-    if withheld is None and config.with_icp and refusal.max_size_error < 1:
-        identity = identify(
-            cloud.cloud_m,
-            best.pose,
-            model.name,
-            prepared.surface,
-            prepared.copies.mirror,
-            best.evidence,
-            observation.focal_px,
-            refusal.max_size_error,
-        )
-        if identity.status == "contradicted":
-            withheld = Refusal(status="doubtful", reason=identity.reason)
+    # A cloud, other than a depth image, may be in another frame than the camera's.
+    hint = f". {OTHER_FRAME}" if cloud.view is None else ""
 
-    facts: dict[str, Any] = {
-        "name": cloud.name,
-        "object": model.name,
+    # Does the view determine a pose, is it right, and is it of this object?
+    measured: dict[str, Any] = {
         "residual_m": float(best.refined.residual_m),
         "evidence": best.evidence,
-        "identity": identity,
     }
-    # A cloud, other than a depth image, may be in another frame than the camera's.
-    hint = OTHER_FRAME if cloud.view is None else ""
-    if withheld is not None:  # all but the pose, so that nobody takes it for an estimate
-        reason = withheld.reason + (hint if withheld.status == "doubtful" else "")
-        return PoseEstimate(status=withheld.status, reason=reason, **facts)
+    try:
+        require_observable(cloud.cloud_m, prepared, best.pose, free, refusal.min_observability)
+        require_right(best.evidence, probability, refusal, is_masked=observation.is_masked)
+        identity = _require_identity(cloud, prepared, best, observation, config, refusal)
+    except Refused as refused:  # all but the pose, so that nobody takes it for an estimate
+        reason = refused.reason + (hint if refused.status == "doubtful" else "")
+        measured = {**measured, **refused.measured}
+        raise Refused(refused.status, reason, **measured) from refused
 
     estimate = PoseEstimate(
+        name=cloud.name,
+        object=model.name,
         status="ok",
         camera_from_model=best.pose.float(),  # computed in double precision
         covariance=without_motions(best.refined.covariance, free).float(),
         free_motions=free.float(),
         certainty=probability * competition.group_share,
         copy_certainty=probability * competition.best_share,
+        identity=identity,
         alternatives=_list_alternatives(competition, probability, prepared),
-        **facts,
+        **measured,
     )
     estimate = with_status(estimate, config.min_certainty)
     if estimate.status == "ambiguous":
@@ -119,14 +103,14 @@ def decide(
     return estimate
 
 
-def why_not_observable(
+def require_observable(
     cloud_m: Float[Tensor, "n 3"],
     prepared: PreparedObject,
     pose: Rigid,
     free: Float[Tensor, "k 6"],
     least: float,
-) -> Refusal | None:
-    """Refuse a view that leaves a motion of the object undetermined, beside its free ones.
+) -> None:
+    """Raise :class:`Refused` where a view leaves a motion beside the free ones undetermined.
 
     The rotation about an axis of near-symmetry may stay undetermined: the copies about it are named
     as alternatives.
@@ -144,19 +128,62 @@ def why_not_observable(
         free = torch.cat([free, free_motions((near_axis,), pose)])
     observed = observability(cloud_m, pose, prepared.surface, free)
     if observed is None:
-        return Refusal(
-            status="doubtful", reason="too few points lie on the posed surface to determine a pose"
-        )
+        raise Refused("doubtful", "too few points lie on the posed surface to determine a pose")
     observable, weakest = observed
     if observable >= least:
-        return None
+        return
     motion = "rotation" if float(weakest[:3].norm()) > math.sqrt(0.5) else "shift"
-    return Refusal(
-        status="not observable",
-        reason=f"the visible part of the object leaves one {motion} undetermined: it moves the "
+    raise Refused(
+        "not observable",
+        f"the visible part of the object leaves one {motion} undetermined: it moves the "
         f"surface along its normals by {observable:.1%} of the motion only; no declared "
         "symmetry allows it. Declare the symmetry, or look from a side that shows more",
     )
+
+
+def require_right(
+    evidence: Evidence, probability: float, refusal: RefusalConfig, *, is_masked: bool
+) -> None:
+    """Raise :class:`Refused` where a pose is right with too small a probability.
+
+    Args:
+        evidence: of the pose.
+        probability: of its being right.
+        refusal: the least probability.
+        is_masked: whether all points were taken for the object's, as a mask gives them.
+    """
+    if probability < refusal.min_probability:
+        raise Refused("doubtful", explain_doubt(evidence, probability, is_masked=is_masked))
+
+
+def _require_identity(
+    cloud: ObjectCloud,
+    prepared: PreparedObject,
+    best: Hypothesis,
+    observation: Observation,
+    config: EstimateConfig,
+    refusal: RefusalConfig,
+) -> Identity | None:
+    """Raise :class:`Refused` where another size or the mirror image of the object fits better.
+
+    Returns:
+        Whether it is this object; None where that is not tested.
+    """
+    if not config.with_icp or refusal.max_size_error >= 1:
+        return None
+    identity = identify(
+        cloud.cloud_m,
+        best.pose,
+        prepared.model.name,
+        prepared.surface,
+        prepared.copies.mirror,
+        best.evidence,
+        observation.focal_px,
+        refusal.max_size_error,
+    )
+    if identity.status == "contradicted":
+        raise Refused("doubtful", identity.reason, identity=identity)
+    return identity
 
 
 def _list_alternatives(
@@ -238,17 +265,6 @@ def with_status(estimate: PoseEstimate, min_certainty: float) -> PoseEstimate:
         + (f"{others} others fit too" if others else "others may fit")
     )
     return replace(estimate, status="ambiguous", reason=reason)
-
-
-def refused(pose_input: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
-    """Make the estimate of an input without a pose."""
-    return PoseEstimate(
-        name=pose_input.name,
-        object=pose_input.object,
-        status=refusal.status,
-        reason=refusal.reason,
-        seconds=seconds,
-    )
 
 
 def choose_object(estimates: Sequence[PoseEstimate], min_certainty: float) -> PoseEstimate:

@@ -34,7 +34,7 @@ _ROUGH_POINTS = 150  # of these points, those that compare starts
 _ROUGH_MIRROR_POINTS = 100  # of these points, those that compare starts of the mirror image
 _STEPS = 12  # steps of ICP with a scale
 _WIDE_STEP = 2.0  # distance limit of the first step, over the usual distance limit
-_CONVERGED = 3e-4  # largest step [rad, m or share] at which ICP with a scale stops
+_CONVERGED = 3e-4  # ICP with a scale stops at a smaller step [rad, diameters, share of the size]
 _LARGEST_GROWTH = 0.1  # by which the size changes in one step, at most
 _LEAST_SCALE = 0.5
 _LARGEST_SCALE = 2.0
@@ -151,7 +151,15 @@ def _fit_scale(
     limits_m = surface.near_m * np.array(factors)
     moved = array_of(local_m).copy()
     scales = array_of(start_scales).copy()
-    _grow(moved, scales, array_of(surface.middle_m), limits_m, surface.target, is_exact)
+    _grow(
+        moved,
+        scales,
+        array_of(surface.middle_m),
+        surface.diameter_m,
+        limits_m,
+        surface.target,
+        is_exact,
+    )
     return torch.from_numpy(scales), torch.from_numpy(moved)
 
 
@@ -160,6 +168,7 @@ def _grow(
     local: Float64[np.ndarray, "b n 3"],
     times: Float64[np.ndarray, " b"],
     middle: Float64[np.ndarray, "3"],
+    diameter: float,
     limits: Float64[np.ndarray, " steps"],
     target: Target,
     is_exact: bool,
@@ -170,6 +179,7 @@ def _grow(
         local: points in the model frame, for each start; changed.
         times: scale of each start; changed.
         middle: about which the surface grows.
+        diameter: of the surface.
         limits: of the distance, for each step.
         target: samples of the surface.
         is_exact: whether samples are searched, not looked up in a table.
@@ -192,6 +202,8 @@ def _grow(
             local[start] = (local[start] - middle - motion[3:6]) @ rotation + middle
             for k in (0, 1, 2, 6):
                 largest = max(largest, abs(motion[k]))
+            for k in (3, 4, 5):
+                largest = max(largest, abs(motion[k]) / diameter)
         if largest < _CONVERGED:
             break
 
