@@ -22,7 +22,7 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import find_weights
 from depthpose.depth.config import MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 from depthpose.report.page import format_markdown_table
 
 DISPARITIES = 192
@@ -267,7 +267,7 @@ def match_by_ours(
     K = torch.tensor([[FOCAL_PX, 0, width / 2], [0, FOCAL_PX, height / 2], [0, 0, 1]])
     rig = StereoRig(width=width, height=height, K=K.double(), baseline_m=0.54)
     views = torch.rand(2, 3, height, width)
-    pair = StereoInput(name="pair", left=views[0], right=views[1], camera=rig)
+    pair = DepthInput(name="pair", left=views[0], right=views[1], camera=rig)
     if isinstance(config, SGBMConfig):
         net = FakestereoNet.load(matcher="sgbm", config=config, with_check=False)
     else:

@@ -38,7 +38,7 @@ from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.stereo.network_matcher import NetworkMatcher
 from depthpose.depth.stereo.search_range import choose_search_range, measure_disparity_range
 from depthpose.depth.synthetic import render_near
-from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import DepthEstimate, DepthInput, DepthSample, DepthTruth
 from depthpose.report.page import format_markdown_table
 
 MAX_PX = 100_000
@@ -48,7 +48,7 @@ SGBM = "SGBM, told the range"
 Result = dict[str, Any]
 
 
-def read_indoor_pair(folder: Path) -> StereoSample:
+def read_indoor_pair(folder: Path) -> DepthSample:
     """Read one pair of the indoor samples; its camera where focal length and doffs are known."""
     left = read_image(folder / "left.png")
     right = read_image(folder / "right.png")
@@ -65,13 +65,13 @@ def read_indoor_pair(folder: Path) -> StereoSample:
             width=width, height=height, K=K, baseline_m=baseline_m, cx_right_minus_left_px=doffs_px
         )
         depth_m = depth_from_disparity(disparity_px, rig)
-    return StereoSample(
-        input=StereoInput(name=folder.name, left=left, right=right, camera=rig),
-        truth=StereoTruth(disparity_px=disparity_px, depth_m=depth_m),
+    return DepthSample(
+        input=DepthInput(name=folder.name, left=left, right=right, camera=rig),
+        truth=DepthTruth(disparity_px=disparity_px, depth_m=depth_m),
     )
 
 
-def indoor_samples(folder: Path | None, *, with_motorcycle: bool = True) -> Iterator[StereoSample]:
+def indoor_samples(folder: Path | None, *, with_motorcycle: bool = True) -> Iterator[DepthSample]:
     """Read the indoor pairs of a folder, and Motorcycle from scikit-image."""
     if folder is not None:
         for meta_file in sorted(folder.glob("*/meta.json")):
@@ -81,14 +81,14 @@ def indoor_samples(folder: Path | None, *, with_motorcycle: bool = True) -> Iter
         yield motorcycle
 
 
-def largest_px(sample: StereoSample) -> float:
+def largest_px(sample: DepthSample) -> float:
     """Compute the largest true disparity of a pair [px]."""
     truth_px = sample.truth.disparity_px
     assert truth_px is not None
     return float(truth_px[truth_px.isfinite()].max())
 
 
-def match_sgbm(sample: StereoSample) -> DepthEstimate:
+def match_sgbm(sample: DepthSample) -> DepthEstimate:
     """Match a pair by SGBM with the range of its truth."""
     pair = sample.input
     assert pair.right is not None
@@ -111,7 +111,7 @@ def is_off_by_twice(disparity_px: Tensor, true_px: Tensor) -> Tensor:
     return (ratio > 2) | (ratio < 0.5)
 
 
-def pair_errors(estimate: DepthEstimate, truth: StereoTruth) -> dict[str, float]:
+def pair_errors(estimate: DepthEstimate, truth: DepthTruth) -> dict[str, float]:
     """Measure the disparity of a pair, and its depth where both are known."""
     assert truth.disparity_px is not None
     assert estimate.disparity_px is not None
@@ -141,7 +141,7 @@ def pair_errors(estimate: DepthEstimate, truth: StereoTruth) -> dict[str, float]
     return errors
 
 
-def compare(samples: Iterable[StereoSample], net: FakestereoNet, name: str) -> list[Result]:
+def compare(samples: Iterable[DepthSample], net: FakestereoNet, name: str) -> list[Result]:
     """Match every pair by both methods, and measure."""
     results: list[Result] = []
     for sample in samples:
@@ -214,25 +214,25 @@ MEASURED, HALVED = "measured", "halved"
 SURE = 0.1  # confidence of a disparity beyond the searched range that is wrongly sure
 
 
-def wide_samples(number: int, seed: int) -> Iterator[StereoSample]:
+def wide_samples(number: int, seed: int) -> Iterator[DepthSample]:
     """Draw near scenes of several widths, with disparities up to 600 px."""
     for index in range(number):
         width = WIDTHS_PX[index % len(WIDTHS_PX)]
         share = min(0.6, PIXEL_BANDS_PX[-1] / width)
         config = NearConfig(seed=seed, columns_px=(width, width), largest_share=share)
         frame = render_near(config, index)
-        yield StereoSample(
-            input=StereoInput(
+        yield DepthSample(
+            input=DepthInput(
                 name=f"{index} {width}x{frame.left.shape[1]}",
                 left=frame.left,
                 right=frame.right,
                 camera=frame.rig,
             ),
-            truth=StereoTruth(disparity_px=frame.disparity_px, depth_m=frame.depth_m),
+            truth=DepthTruth(disparity_px=frame.disparity_px, depth_m=frame.depth_m),
         )
 
 
-def last_searched_px(net: FakestereoNet, pair: StereoInput) -> float:
+def last_searched_px(net: FakestereoNet, pair: DepthInput) -> float:
     """Compute the largest disparity that is searched in a pair [px]."""
     assert isinstance(net.matcher, NetworkMatcher)
     assert pair.right is not None
@@ -241,7 +241,7 @@ def last_searched_px(net: FakestereoNet, pair: StereoInput) -> float:
     return search.end_in_images_px
 
 
-def match_wide(samples: Iterable[StereoSample], net: FakestereoNet) -> list[Result]:
+def match_wide(samples: Iterable[DepthSample], net: FakestereoNet) -> list[Result]:
     """Match every pair with the range that is measured and with half of it; measure by band."""
     assert isinstance(net.matcher, NetworkMatcher)
     results: list[Result] = []

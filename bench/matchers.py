@@ -21,14 +21,14 @@ from depthpose.demo import read_motorcycle
 from depthpose.depth.config import MatcherConfig, SGBMConfig
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.types import StereoSample
+from depthpose.depth.types import DepthSample
 from depthpose.report.page import format_markdown_table
 
 SGBM = "SGBM, holes filled"
 LIMITS_PX = (1.0, 2.0, 3.0)
 
 
-def samples(data: Path | None, number: int) -> Iterator[StereoSample]:
+def samples(data: Path | None, number: int) -> Iterator[DepthSample]:
     """Read pairs with true disparity, spread evenly over a dataset."""
     if data is None:
         motorcycle = read_motorcycle()
@@ -52,7 +52,7 @@ def make_nets(names: list[str]) -> dict[str, FakestereoNet]:
     return {SGBM: FakestereoNet.load(matcher="sgbm", with_check=False), **ours}
 
 
-def sgbm_for(sample: StereoSample) -> FakestereoNet:
+def sgbm_for(sample: DepthSample) -> FakestereoNet:
     """Build SGBM with the range of a pair."""
     truth_px = sample.truth.disparity_px
     assert truth_px is not None
@@ -64,7 +64,7 @@ def sgbm_for(sample: StereoSample) -> FakestereoNet:
     return FakestereoNet.load(matcher="sgbm", config=config, with_check=False)
 
 
-def measure(net: FakestereoNet, sample: StereoSample) -> dict[str, float]:
+def measure(net: FakestereoNet, sample: DepthSample) -> dict[str, float]:
     """Match a pair; return its errors, wall time and CPU time."""
     truth_px = sample.truth.disparity_px
     assert truth_px is not None

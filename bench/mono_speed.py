@@ -41,7 +41,7 @@ from depthpose.depth.stereo import (
     match_in_usual_range,
 )
 from depthpose.depth.synthesis import make_synthesiser
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 from depthpose.depth.weights import MATCHERS
 from depthpose.report.page import format_markdown_table
 
@@ -59,12 +59,12 @@ def make_net(weights: str, config: MatcherConfig) -> FakestereoNet:
     )
 
 
-def street() -> StereoInput:
+def street() -> DepthInput:
     """Make an image of KITTI's size, of noise: time does not depend on what it shows."""
     K = torch.tensor([[FOCAL_PX, 0, 609.6], [0, FOCAL_PX, 172.9], [0, 0, 1]], dtype=torch.float64)
     rig = StereoRig(width=WIDTH, height=HEIGHT, K=K, baseline_m=0.5327)
     image = torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
-    return StereoInput(name="street", left=image, right=None, camera=rig)
+    return DepthInput(name="street", left=image, right=None, camera=rig)
 
 
 def warm_seconds(run: Callable[[], object], device: str) -> float:

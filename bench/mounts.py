@@ -46,7 +46,7 @@ from depthpose.depth.synthetic.sensor import draw_sensors, expose
 from depthpose.depth.synthetic.shading import prepare_stage
 from depthpose.depth.synthetic.street import make_street
 from depthpose.depth.synthetic.visibility import render_light, view_from
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 from depthpose.report.page import format_markdown_table, write_table
 
 WIDTH, HEIGHT = 640, 360
@@ -91,7 +91,7 @@ class View:
 
     camera: str
     drive: str
-    image: StereoInput
+    image: DepthInput
     depth_m: np.ndarray
     mount: tuple[float, float] | None
 
@@ -141,7 +141,7 @@ def synthetic_views(folder: Path, first_street: int, count: int) -> Iterator[Vie
             np.savez_compressed(path, **arrays)
         arrays = np.load(path)
         left = torch.from_numpy(arrays["picture"]).float() / 255
-        image = StereoInput(name=name, left=left, right=None, camera=camera_of_fov(fov_deg))
+        image = DepthInput(name=name, left=left, right=None, camera=camera_of_fov(fov_deg))
         use = "choice, synthetic" if street >= FIRST_CHOICE_STREET else "synthetic"
         yield View(
             camera=f"{use} {height_m} m",
@@ -203,7 +203,7 @@ def view_with_scan(name: str, path: Path, K: np.ndarray, points_m: np.ndarray) -
     return View(
         camera=name,
         drive=name,
-        image=StereoInput(name=path.stem, left=left, right=None, camera=camera),
+        image=DepthInput(name=path.stem, left=left, right=None, camera=camera),
         depth_m=project_depth(points_m, K, height, width),
         mount=mount_of_scan(points_m),
     )
@@ -220,7 +220,7 @@ def view_with_disparity(name: str, drive: str, left: Path, truth: Path, rig: Ste
     return View(
         camera=name,
         drive=drive,
-        image=StereoInput(name=left.stem, left=read_image(left), right=None, camera=camera),
+        image=DepthInput(name=left.stem, left=read_image(left), right=None, camera=camera),
         depth_m=depth_m,
         mount=None if ground is None else (ground.height_m, ground.tilt_deg),
     )

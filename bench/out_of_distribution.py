@@ -33,7 +33,7 @@ from depthpose.depth.config import MatcherConfig
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.disparity import resize_image
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 from depthpose.report.page import format_markdown_table, write_table
 
 TRAINED = ("street_pairs/kitti2015_train_drives", "street_pairs/kitti_object_more",
@@ -55,17 +55,17 @@ Row = dict[str, Any]
 KITTI360_PX = 552.55
 
 
-def with_camera(name: str, image: Tensor, focal_px: float | None = None) -> StereoInput:
+def with_camera(name: str, image: Tensor, focal_px: float | None = None) -> DepthInput:
     """Make an input whose optical axis goes through its centre."""
     height, width = image.shape[1:]
     f = USUAL_FOCAL_LENGTH * max(height, width) if focal_px is None else focal_px
     K = torch.tensor([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]]).double()
-    return StereoInput(
+    return DepthInput(
         name=name, left=image, right=None, camera=Camera(width=width, height=height, K=K)
     )
 
 
-def dgp(folder: Path) -> Iterator[StereoInput]:
+def dgp(folder: Path) -> Iterator[DepthInput]:
     """Read the pictures of scenes in DGP's layout, with their intrinsics."""
     for scene in sorted(folder.glob("scene_*")):
         (calibration,) = scene.glob("calibration/*.json")
@@ -76,7 +76,7 @@ def dgp(folder: Path) -> Iterator[StereoInput]:
             yield with_camera(path.stem, read_image(path), focal_px)
 
 
-def pairs(samples: Path, folders: tuple[str, ...]) -> Iterator[tuple[str, StereoInput]]:
+def pairs(samples: Path, folders: tuple[str, ...]) -> Iterator[tuple[str, DepthInput]]:
     """Read the left images of folders of pairs, with their source."""
     for folder in folders:
         dataset = open_dataset(samples / "depth" / folder)
@@ -86,7 +86,7 @@ def pairs(samples: Path, folders: tuple[str, ...]) -> Iterator[tuple[str, Stereo
             yield f"KITTI, {'evaluation' if is_evaluation else 'training'} drives", image
 
 
-def streets(samples: Path) -> Iterator[tuple[str, StereoInput]]:
+def streets(samples: Path) -> Iterator[tuple[str, DepthInput]]:
     """Read real streets, with their source."""
     yield from pairs(samples, TRAINED + EVALUATION)
     for path in sorted((samples / "depth/kitti_raw").glob("*/*_drive_0052_sync/image_02/data/*")):
@@ -177,7 +177,7 @@ def text(rng: np.random.Generator) -> Image.Image:
     return image
 
 
-def changed(street: StereoInput) -> Iterator[tuple[str, StereoInput]]:
+def changed(street: DepthInput) -> Iterator[tuple[str, DepthInput]]:
     """Change a street to images that no camera of a car takes."""
     assert street.camera is not None
     image, focal_px = street.left, float(street.camera.K[0, 0])
@@ -221,7 +221,7 @@ def parts(picture: Tensor) -> Iterator[tuple[str, Tensor]]:
         yield "quarters", part.contiguous()
 
 
-def other_images(samples: Path, folders: list[Path]) -> Iterator[tuple[str, StereoInput]]:
+def other_images(samples: Path, folders: list[Path]) -> Iterator[tuple[str, DepthInput]]:
     """Read and generate images that are no street, or no street as the camera of a car sees it."""
     for source, name, image in whole_pictures(folders):
         for kind, part in parts(image):

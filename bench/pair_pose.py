@@ -36,7 +36,7 @@ from depthpose.depth.synthetic.materials import Appearance
 from depthpose.depth.synthetic.mesh import MeshBuilder
 from depthpose.depth.synthetic.projector import Projector
 from depthpose.depth.synthetic.scene import NO_MARKINGS, SyntheticScene, draw_weather
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 from depthpose.pose.config import SyntheticSensorConfig
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import SUCCESS_SHARE, adds_m
@@ -211,7 +211,7 @@ def table_scenes(number: int) -> Iterator[tuple[str, str, int, TableScene]]:
 
 def match_table(net: FakestereoNet, scene: TableScene) -> tuple[Tensor, Tensor, float]:
     """Match a scene; return its sure depth, the deviation of depth, and the share left out."""
-    pair = StereoInput(name="table", left=scene.left, right=scene.right, camera=scene.rig)
+    pair = DepthInput(name="table", left=scene.left, right=scene.right, camera=scene.rig)
     estimate = net.estimate_input(pair)
     assert estimate.depth_m is not None
     assert estimate.confidence is not None

@@ -18,7 +18,7 @@ from shared import group_rows, mean_of, with_cpu_seconds
 from depthpose import FakestereoNet
 from depthpose.depth.datasets import open_dataset, read_true_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M, garg_crop, measure
-from depthpose.depth.types import DepthEstimate, StereoSample
+from depthpose.depth.types import DepthEstimate, DepthSample
 
 OURS = "default"
 CAP_M = 80.0
@@ -51,7 +51,7 @@ def match_indoor(folder: Path) -> list[Row]:
     return rows
 
 
-def match_by_both(sample: StereoSample) -> list[tuple[str, DepthEstimate, float]]:
+def match_by_both(sample: DepthSample) -> list[tuple[str, DepthEstimate, float]]:
     """Match a pair by SGBM and by ours; return method, estimate and CPU seconds of each."""
     net = network()
     sgbm, sgbm_s = with_cpu_seconds(lambda: match_sgbm(sample))

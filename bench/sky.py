@@ -15,14 +15,14 @@ from tqdm import tqdm
 from depthpose import FakestereoNet
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import Streets
-from depthpose.depth.types import StereoSample
+from depthpose.depth.types import DepthSample
 from depthpose.report.page import format_markdown_table
 
 SEED = 90  # no weights were trained on streets of this seed
 FAR_M = 80.0
 
 
-def measure(name: str, input: str, streets: list[StereoSample]) -> dict[str, object]:
+def measure(name: str, input: str, streets: list[DepthSample]) -> dict[str, object]:
     """Measure a network's depth in the sky and elsewhere, from one view or from both."""
     net = FakestereoNet.load(name, allow_ood=True, with_check=False)
     sky_depths_m: list[Tensor] = []

@@ -36,7 +36,7 @@ from depthpose.depth.synthetic.sensor import draw_sensors, expose
 from depthpose.depth.synthetic.shading import prepare_stage
 from depthpose.depth.synthetic.street import make_street
 from depthpose.depth.synthetic.visibility import render_light, view_from
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.report.page import format_markdown_table
 
@@ -52,7 +52,7 @@ def rotation(pitch: float, yaw: float, roll: float) -> np.ndarray:
     return z @ x @ y
 
 
-def street_view(seed: int, index: int) -> StereoInput | None:
+def street_view(seed: int, index: int) -> DepthInput | None:
     """Render a synthetic street by a random camera, 1 to 3 m high and tilted up to 6 degrees.
 
     The axis lies up to 0.85 focal lengths off the centre, as in a part of a wide view; half of the
@@ -129,7 +129,7 @@ def degraded(image: Tensor, rng: np.random.Generator) -> Tensor:
     return image.contiguous()
 
 
-def gather(options: argparse.Namespace) -> Iterator[tuple[str, bool, StereoInput]]:
+def gather(options: argparse.Namespace) -> Iterator[tuple[str, bool, DepthInput]]:
     """Yield images with their kind (of streets their source), and whether they are streets."""
     rng = np.random.default_rng(1)
     for index in range(options.views):
@@ -158,7 +158,7 @@ def gather(options: argparse.Namespace) -> Iterator[tuple[str, bool, StereoInput
 
 
 @torch.no_grad()
-def features(generator: SelectionGenerator, street: StereoInput) -> np.ndarray:
+def features(generator: SelectionGenerator, street: DepthInput) -> np.ndarray:
     """Compute the input of the layer: three moments over the rows of the deepest features."""
     assert street.camera is not None
     scale = generator.config.virtual_focal_px / float(street.camera.K[0, 0])

@@ -11,7 +11,7 @@ import yaml
 
 from depthpose.core.camera import RawCamera, RawPair, StereoRig
 from depthpose.core.rigid import Rigid
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 
 BENT = {False: (-0.25, 0.08, 0.001, -0.0005, 0.0), True: (0.05, -0.02, 0.01, 0.0)}
 """Distortion of a pinhole, and of a fisheye lens."""
@@ -36,7 +36,7 @@ class DrawnPair:
     turns: tuple[np.ndarray, np.ndarray]
 
 
-def make_raw(seen: StereoInput, *, is_fisheye: bool = False) -> DrawnPair:
+def make_raw(seen: DepthInput, *, is_fisheye: bool = False) -> DrawnPair:
     """Draw a rectified pair as two turned lenses see it, in the size of the pair."""
     rig = seen.camera
     assert isinstance(rig, StereoRig)

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from depthpose.core.camera import StereoRig
 from depthpose.core.files import cache_folder, write_depth_png, write_image
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import DepthInput, DepthSample, DepthTruth
 
 GROUND_Y_M = 1.65
 SUN = (0.45, -0.75, -0.48)
@@ -67,7 +67,7 @@ class Hit:
     solid: Int64[Tensor, " n"]
 
 
-def make_street(scale: float = 1.0) -> StereoSample:
+def make_street(scale: float = 1.0) -> DepthSample:
     """Draw the pair and its exact disparity; each size once for all processes of a test run.
 
     Args:
@@ -83,14 +83,14 @@ def make_street(scale: float = 1.0) -> StereoSample:
     assert truth.depth_m is not None
     left, right = given.left.clone(), given.right.clone()
     disparity_px, depth_m = truth.disparity_px.clone(), truth.depth_m.clone()
-    return StereoSample(
+    return DepthSample(
         input=replace(given, left=left, right=right),
         truth=replace(truth, disparity_px=disparity_px, depth_m=depth_m),
     )
 
 
 @cache
-def _drawn(scale: float) -> StereoSample:
+def _drawn(scale: float) -> DepthSample:
     rig = _kitti_like_rig(scale)
     drawn = cache_folder() / f"street-{scale}.pt"
     drawn.parent.mkdir(parents=True, exist_ok=True)
@@ -104,9 +104,9 @@ def _drawn(scale: float) -> StereoSample:
             torch.save([*views, depth_m], drawn)
         left, right, depth_m = torch.load(drawn)
     true_px = disparity_from_depth(depth_m, rig)
-    return StereoSample(
-        input=StereoInput(name="street", left=left, right=right, camera=rig),
-        truth=StereoTruth(disparity_px=true_px.float(), depth_m=depth_m.float()),
+    return DepthSample(
+        input=DepthInput(name="street", left=left, right=right, camera=rig),
+        truth=DepthTruth(disparity_px=true_px.float(), depth_m=depth_m.float()),
     )
 
 

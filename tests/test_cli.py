@@ -21,7 +21,7 @@ from depthpose.cli.arguments import Source, WeightsName, make_parser, refuse_mis
 from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_map, write_image, write_json
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 
 NAMES = [name.split() for name in COMMANDS]
 
@@ -39,7 +39,7 @@ def pair_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _camera_file(pair: StereoInput) -> dict[str, object]:
+def _camera_file(pair: DepthInput) -> dict[str, object]:
     assert pair.camera is not None
     K = pair.camera.K.tolist()
     return {"width": pair.camera.width, "height": pair.camera.height, "K": K, "baseline_m": 0.54}

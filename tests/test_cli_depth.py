@@ -41,7 +41,7 @@ from depthpose.core.loop import Progress, read_metrics
 from depthpose.depth.estimator import net
 from depthpose.depth.stereo import Matcher, PSMNet, SGBMMatcher
 from depthpose.depth.synthesis import Synthesiser
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 from depthpose.depth.weights import write_depth_weights
 
 CAMERA = {"width": 64, "height": 48, "K": [[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]]}
@@ -316,7 +316,7 @@ def test_a_frame_of_a_video_that_is_refused_leaves_the_others(
     def refuse_one(
         synthesiser: Synthesiser,
         matcher: Matcher | None,
-        images: Sequence[StereoInput],
+        images: Sequence[DepthInput],
         *,
         allow_ood: bool,
     ) -> list[DepthEstimate]:
@@ -340,7 +340,7 @@ def roads() -> Iterator[None]:
     def estimate(
         synthesiser: Synthesiser,
         matcher: Matcher | None,
-        images: Sequence[StereoInput],
+        images: Sequence[DepthInput],
         *,
         allow_ood: bool,
     ) -> list[DepthEstimate]:

@@ -27,11 +27,11 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_image
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.stereo import SGBMMatcher
-from depthpose.depth.types import StereoSample
+from depthpose.depth.types import DepthSample
 
 
 @pytest.fixture(scope="module")
-def street() -> StereoSample:
+def street() -> DepthSample:
     return make_street(0.4)
 
 
@@ -42,7 +42,7 @@ EITHER = pytest.mark.parametrize(
 
 
 @pytest.fixture(scope="module")
-def drawn(request: pytest.FixtureRequest, street: StereoSample) -> DrawnPair:
+def drawn(request: pytest.FixtureRequest, street: DepthSample) -> DrawnPair:
     return make_raw(street.input, is_fisheye=getattr(request, "param", False))
 
 
@@ -80,7 +80,7 @@ def test_rows_agree_after_and_not_before(drawn: DrawnPair) -> None:
 
 @EITHER
 def test_depth_of_the_rectified_pair_is_that_of_the_street(
-    drawn: DrawnPair, street: StereoSample
+    drawn: DrawnPair, street: DepthSample
 ) -> None:
     rectifier = rectifier_of(drawn)
     rig = rectifier.rig

@@ -22,7 +22,7 @@ from depthpose.core.files import read_image, write_depth_png, write_image
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.evaluate import Evaluation, EvaluationRow
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 from depthpose.thesis.depth import TABLES
 
 CAMERA_Z = ("--protocol", "eigen-raw-camera")
@@ -35,7 +35,7 @@ class FlatMono:
         self.depth_m = depth_m
         self.seen: list[str] = []
 
-    def estimate_input(self, pair: StereoInput) -> DepthEstimate:
+    def estimate_input(self, pair: DepthInput) -> DepthEstimate:
         assert isinstance(pair.camera, StereoRig)
         is_mono = pair.right is None
         self.seen.append("left" if is_mono else "both")

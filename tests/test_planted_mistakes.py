@@ -26,7 +26,7 @@ from depthpose.core.files.images import check_image
 from depthpose.core.units import Unit
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.estimator import check_rectified_pair
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 from depthpose.depth.unit_mistakes import find_unit_mistake
 from depthpose.pose.cloud import prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig
@@ -75,7 +75,7 @@ def good_pair() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def look(left: torch.Tensor, right: torch.Tensor) -> None:
-    given = StereoInput(name="pair", left=left, right=right, camera=None)
+    given = DepthInput(name="pair", left=left, right=right, camera=None)
     check_rectified_pair(given)
 
 

@@ -25,7 +25,7 @@ from depthpose.depth.metrics import measure
 from depthpose.depth.predictions import CLOUD_M, OutputOptions, write_estimate
 from depthpose.depth.protocols import clamped_depth_from_disparity
 from depthpose.depth.synthetic import Streets
-from depthpose.depth.types import DepthError, DepthEstimate, StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import DepthError, DepthEstimate, DepthInput, DepthSample, DepthTruth
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import (
     BopDataset,
@@ -84,7 +84,7 @@ _MOTORCYCLE_RANGE_M = (1.5, 8.0)
 class _DepthScene(NamedTuple):
     """A pair with its truth, what the page says of it, and the depths of its colours."""
 
-    sample: StereoSample
+    sample: DepthSample
     text: str
     range_m: tuple[float, float]  #: depth of the brightest and of the darkest colour
 
@@ -125,7 +125,7 @@ def show_depth(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     return rows, sections
 
 
-def _choose_methods(network: FakestereoNet, sample: StereoSample) -> list[_DepthMethod]:
+def _choose_methods(network: FakestereoNet, sample: DepthSample) -> list[_DepthMethod]:
     """Choose the methods for a scene: the networks, and OpenCV's matcher.
 
     Depth from one image is only for the street: the generator was trained on streets alone.
@@ -224,7 +224,7 @@ def _name_folder(out: Path, method: _DepthMethod) -> Path:
     return out / method.name.lower().replace(",", "").replace(" ", "-")
 
 
-def _measure_depth(estimate: DepthEstimate, sample: StereoSample) -> dict[str, float]:
+def _measure_depth(estimate: DepthEstimate, sample: DepthSample) -> dict[str, float]:
     """Measure disparity and depth, over pixels with an estimate and a truth nearer than the cap.
 
     Returns the metrics by name; ``coverage`` is the share of the pixels with such a truth that have
@@ -244,7 +244,7 @@ def _measure_depth(estimate: DepthEstimate, sample: StereoSample) -> dict[str, f
     return row
 
 
-def read_motorcycle() -> StereoSample | None:
+def read_motorcycle() -> DepthSample | None:
     """Read the pair Motorcycle with its true disparity, as scikit-image ships it.
 
     None where scikit-image is not installed.
@@ -268,11 +268,11 @@ def read_motorcycle() -> StereoSample | None:
     # Truth and views.
     disparity_px = torch.from_numpy(np.array(disparity, np.float32))
     disparity_px[~torch.isfinite(disparity_px)] = torch.nan
-    truth = StereoTruth(disparity_px=disparity_px, depth_m=depth_from_disparity(disparity_px, rig))
+    truth = DepthTruth(disparity_px=disparity_px, depth_m=depth_from_disparity(disparity_px, rig))
     left_view = torch.from_numpy(np.array(left)).permute(2, 0, 1).float() / 255
     right_view = torch.from_numpy(np.array(right)).permute(2, 0, 1).float() / 255
-    pair = StereoInput(name="motorcycle", left=left_view, right=right_view, camera=rig)
-    return StereoSample(input=pair, truth=truth)
+    pair = DepthInput(name="motorcycle", left=left_view, right=right_view, camera=rig)
+    return DepthSample(input=pair, truth=truth)
 
 
 _FRAMES_SEED = 9

@@ -14,7 +14,7 @@ from tests.raw_pairs import DrawnPair, make_raw, opencv_names, write_kalibr, wri
 
 from depthpose.core.camera import RawPair, StereoRig, read_camera, read_raw_pair
 from depthpose.core.errors import InputError, Notice
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 
 SIZE = (64, 48)
 
@@ -24,7 +24,7 @@ def drawn(request: pytest.FixtureRequest) -> DrawnPair:
     K = torch.tensor([[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]], dtype=torch.float64)
     rig = StereoRig(width=64, height=48, K=K, baseline_m=0.12)
     image = torch.rand(3, 48, 64)
-    seen = StereoInput(name="pair", left=image, right=image, camera=rig)
+    seen = DepthInput(name="pair", left=image, right=image, camera=rig)
     return make_raw(seen, is_fisheye=request.param)
 
 

@@ -10,7 +10,7 @@ from depthpose.core.files import write_depth_png, write_image
 from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline, fill_by_pyramid
 from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, read_true_depth
 from depthpose.depth.disparity import depth_from_disparity
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 
 W, H = 48, 32
 
@@ -35,8 +35,8 @@ def write_frames(home: Path, frames: dict[str, tuple[torch.Tensor, torch.Tensor]
     return open_dataset(home)
 
 
-def pair_of(image: torch.Tensor, camera: StereoRig | None = None) -> StereoInput:
-    return StereoInput(name="x", left=image, right=None, camera=camera or rig())
+def pair_of(image: torch.Tensor, camera: StereoRig | None = None) -> DepthInput:
+    return DepthInput(name="x", left=image, right=None, camera=camera or rig())
 
 
 def test_rows_learn_a_road(tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
 
 def test_a_baseline_needs_a_rig(tmp_path: Path) -> None:
     data = write_frames(tmp_path, {"a": (torch.rand(3, H, W), road_m())})
-    pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
+    pair = DepthInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
     for baseline in (RowDepthBaseline.fit(data), NearestImageBaseline.fit(data)):
         with pytest.raises(InputError, match="x: has no rig"):
             baseline.estimate_input(pair)

@@ -10,15 +10,15 @@ from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.depth.stereo import CallableMatcher, infinity_px
-from depthpose.depth.types import DepthEstimate, Match, StereoInput, StereoSample
+from depthpose.depth.types import DepthEstimate, DepthInput, DepthSample, Match
 
 
 @pytest.fixture(scope="module")
-def street() -> StereoSample:
+def street() -> DepthSample:
     return make_street(0.4)
 
 
-def test_the_street_is_estimated_in_metres(street: StereoSample) -> None:
+def test_the_street_is_estimated_in_metres(street: DepthSample) -> None:
     pair, truth_m = street.input, street.truth.depth_m
     assert pair.right is not None
     assert truth_m is not None
@@ -29,7 +29,7 @@ def test_the_street_is_estimated_in_metres(street: StereoSample) -> None:
     assert error < 0.03
 
 
-def test_files_arrays_and_tensors_give_one_answer(street: StereoSample, tmp_path: Path) -> None:
+def test_files_arrays_and_tensors_give_one_answer(street: DepthSample, tmp_path: Path) -> None:
     pair = street.input
     assert pair.right is not None
     assert pair.camera is not None
@@ -78,7 +78,7 @@ def test_an_unusable_pair_is_refused(
         net.estimate(torch.zeros(3, 20, 30), camera, right=right)
 
 
-def test_a_swapped_pair_is_recognised(street: StereoSample) -> None:
+def test_a_swapped_pair_is_recognised(street: DepthSample) -> None:
     pair = street.input
     net = FakestereoNet.load(matcher="sgbm")
     assert pair.right is not None
@@ -115,7 +115,7 @@ def test_an_estimate_is_one_readable_line() -> None:
     depth_m = torch.full((20, 30), 4.0)
     depth_m[:10], depth_m[0], depth_m[1, 1] = 12, torch.nan, 45_399  # one pixel is far away
     px, sky = torch.full((20, 30), 8.0), torch.arange(20)[:, None].expand(20, 30) < 1
-    seen = StereoInput(name="a", left=torch.zeros(3, 20, 30), right=None, camera=None)
+    seen = DepthInput(name="a", left=torch.zeros(3, 20, 30), right=None, camera=None)
     whole = DepthEstimate(
         input=seen, depth_m=depth_m, disparity_px=px, confidence=px / 16, is_sky=sky
     )
@@ -224,7 +224,7 @@ def test_every_way_refuses_a_pair_that_is_none_and_warns_of_doubt(how: str) -> N
     def estimate(left: torch.Tensor, right: torch.Tensor, *, with_check: bool) -> DepthEstimate:
         matcher = CallableMatcher(lambda left, _: left.mean(0) * 0 + 3)
         net = FakestereoNet(matcher, with_check=with_check)
-        pair = StereoInput(name="street", left=left, right=right, camera=None)
+        pair = DepthInput(name="street", left=left, right=right, camera=None)
         if how == "estimate":
             return net.estimate(left, right=right, name="street")
         if how == "estimate_input":

@@ -38,7 +38,7 @@ from depthpose.depth.evaluate import measure_image_confidence
 from depthpose.depth.generators import SelectionGenerator, UNetGenerator
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher, SearchRange
 from depthpose.depth.synthesis import make_synthesiser
-from depthpose.depth.types import DepthEstimate, Match, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput, Match
 from depthpose.depth.weights import (
     calibrate_weights,
     read_generator,
@@ -224,7 +224,7 @@ def test_many_images_give_what_each_gives_alone(generator: UNetGenerator, tmp_pa
     net = FakestereoNet.load(path)
     sizes = [(60, 40), (60, 40), (72, 40), (60, 40)]
     inputs = [
-        StereoInput(
+        DepthInput(
             name=f"{k}",
             left=torch.rand(3, height, width, generator=torch.Generator().manual_seed(k)),
             right=None,
@@ -251,8 +251,8 @@ def test_among_many_a_pair_is_matched_with_its_right_view(
     net = FakestereoNet.load(path, with_check=False)
     left, right = torch.rand(2, 3, 40, 60, generator=torch.Generator().manual_seed(0))
     rig = camera(60, 40, 100.0, baseline_m=0.2)
-    alone = StereoInput(name="alone", left=left, right=None, camera=rig)
-    pair = StereoInput(name="pair", left=left, right=right, camera=rig)
+    alone = DepthInput(name="alone", left=left, right=None, camera=rig)
+    pair = DepthInput(name="pair", left=left, right=right, camera=rig)
     many = each_of(net, [alone, pair, pair, alone], batch=4)
     for given, found in zip([alone, pair, pair, alone], many, strict=True):
         one = net.estimate_input(given)
@@ -267,7 +267,7 @@ def test_what_cannot_be_used_costs_the_others_nothing(
     """A file that is none, a broken array and a pair without a baseline, among images."""
     net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     good = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(0))
-    pair = StereoInput(name="pair", left=good, right=good, camera=camera(60, 40, 100.0))
+    pair = DepthInput(name="pair", left=good, right=good, camera=camera(60, 40, 100.0))
     given = [good, tmp_path / "none.png", good * 255, pair, good.flip(-1)]
     found = net.estimate_many(given, focal_px=100.0, batch=batch, threads=threads)
     errors = [str(one) for one in found if isinstance(one, InputError)]
@@ -330,7 +330,7 @@ def test_values_that_are_no_picture_are_refused(
         r"holds NaN": torch.where(image > 0.5, image, torch.nan),
     }
     for message, given in broken.items():
-        sees = StereoInput(
+        sees = DepthInput(
             name="street", left=given, right=given.flip(-1) if with_right else None, camera=rig
         )
         for estimate in (net.estimate_input, lambda one: each_of(net, [one])):
@@ -560,7 +560,7 @@ def test_a_generator_with_an_answer_of_its_own_needs_no_matcher(tmp_path: Path) 
     found = net.estimate(image, rig).depth_m
     assert found is not None
     assert float(found.mean()) == pytest.approx(FOCAL_PX * BASELINE_M / 4, rel=1e-4)
-    pair = StereoInput(name="street", left=image, right=image.flip(-1), camera=rig)
+    pair = DepthInput(name="street", left=image, right=image.flip(-1), camera=rig)
     for estimate in (net.estimate_input, lambda one: each_of(net, [one])):
         with pytest.raises(InputError, match=r"street: .*a pair needs a matcher.*matcher='sgbm'"):
             estimate(pair)
@@ -672,7 +672,7 @@ def test_a_threshold_is_chosen_by_known_images(tmp_path: Path) -> None:
     given, out = tmp_path / "w.safetensors", tmp_path / "c.safetensors"
     write_depth_weights(given, generator=unsure(0.0), facts={"licence": "MIT"})
     images = [
-        StereoInput(name=str(k), left=torch.rand(3, 40, 60), right=None,
+        DepthInput(name=str(k), left=torch.rand(3, 40, 60), right=None,
                     camera=camera(60, 40, FOCAL_PX))
         for k in range(5)
     ]  # fmt: skip
@@ -698,7 +698,7 @@ def test_a_generator_without_confidence_cannot_be_calibrated(
     with pytest.raises(InputError, match="holds no generator that selects"):
         calibrate_weights(given, [0.5, 0.6], 0.5, tmp_path / "c.safetensors")
     net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
-    image = StereoInput(name="a", left=torch.rand(3, 40, 60), right=None,
+    image = DepthInput(name="a", left=torch.rand(3, 40, 60), right=None,
                         camera=camera(60, 40, FOCAL_PX))  # fmt: skip
     with pytest.raises(InputError, match="no generator with a confidence of its own"):
         measure_image_confidence(net, [image])

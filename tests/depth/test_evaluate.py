@@ -28,7 +28,7 @@ from depthpose.depth.predictions import (
 )
 from depthpose.depth.protocols import clamped_depth_from_disparity
 from depthpose.depth.stereo import CallableMatcher
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 from depthpose.depth.unit_mistakes import find_unit_mistake
 
 W, H = 64, 32
@@ -449,7 +449,7 @@ def test_predicting_goes_on_where_it_stopped(pairs: Dataset, tmp_path: Path) -> 
 
 
 def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:
-    pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
+    pair = DepthInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
     estimate = DepthEstimate(
         input=pair, depth_m=None, disparity_px=truth_px(0), right=torch.rand(3, H, W)
     )
@@ -463,7 +463,7 @@ def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:
 
 
 def test_an_estimate_is_read_back(tmp_path: Path) -> None:
-    pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=rig())
+    pair = DepthInput(name="x", left=torch.rand(3, H, W), right=None, camera=rig())
     depth_m = depth_from_disparity(truth_px(0), rig())
     right = torch.ones(3, H, W) / 255
     estimate = DepthEstimate(

@@ -10,18 +10,18 @@ import torch
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import MissingExtraError
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.types import Match, StereoInput
+from depthpose.depth.types import DepthInput, Match
 
 H, W, F = 4, 6, 8.0
 DEPTH_M = torch.arange(1, H * W + 1, dtype=torch.float32).reshape(H, W) * 4
 DEPTH_M[1, 2] = torch.nan
 
 
-def pair() -> StereoInput:
+def pair() -> DepthInput:
     K = torch.tensor([[F, 0, 2.5], [0, F, 1.5], [0, 0, 1]], dtype=torch.float64)
     rig = StereoRig(width=W, height=H, K=K, baseline_m=0.5)
     left = torch.rand(3, H, W, generator=torch.Generator().manual_seed(0))
-    return StereoInput(name="a", left=left, right=left.flip(2), camera=rig)
+    return DepthInput(name="a", left=left, right=left.flip(2), camera=rig)
 
 
 class KnowsDepth:

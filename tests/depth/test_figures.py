@@ -3,16 +3,16 @@ import torch
 
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 from depthpose.report.page import Drawing
 from depthpose.thesis.depth import arrange_columns, draw_figure_2_1, draw_figure_2_5
 
 H, W = 20, 60
 
 
-def pair(with_right: bool = True) -> StereoInput:
+def pair(with_right: bool = True) -> DepthInput:
     right = torch.rand(3, H, W) if with_right else None
-    return StereoInput(name="f", left=torch.rand(3, H, W), right=right, camera=None)
+    return DepthInput(name="f", left=torch.rand(3, H, W), right=right, camera=None)
 
 
 def estimate(depth_m: float | None = 10.0, with_right: bool = True) -> DepthEstimate:
@@ -68,7 +68,7 @@ def test_one_depth_has_one_colour_in_every_panel() -> None:
     ],
 )
 def test_what_figure_2_1_cannot_show_is_said(
-    frame: StereoInput, mono: DepthEstimate, message: str
+    frame: DepthInput, mono: DepthEstimate, message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
         draw_figure_2_1(frame, lidar(), mono, estimate())

@@ -19,7 +19,7 @@ from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.ground import fit_ground
 from depthpose.depth.mount import MountFilter, scale_by_distance, scale_by_mount
 from depthpose.depth.predictions import write_estimate
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 
 K = torch.tensor([[300.0, 0, 199.5], [0, 300, 99.5], [0, 0, 1]], dtype=torch.float64)
 CAMERA = Camera(width=400, height=200, K=K)
@@ -45,14 +45,14 @@ def estimate(depth_m: Float[Tensor, "h w"]) -> DepthEstimate:
     return DepthEstimate(input=seen(), depth_m=known, disparity_px=px, is_sky=is_sky)
 
 
-def seen(**mount: float) -> StereoInput:
+def seen(**mount: float) -> DepthInput:
     """Make an input of the camera with what is known of its mount."""
     camera = replace(CAMERA, **mount)
-    return StereoInput(name="street", left=torch.zeros(3, 200, 400), right=None, camera=camera)
+    return DepthInput(name="street", left=torch.zeros(3, 200, 400), right=None, camera=camera)
 
 
 def correct(
-    given: DepthEstimate, image: StereoInput, mount: MountFilter | None = None
+    given: DepthEstimate, image: DepthInput, mount: MountFilter | None = None
 ) -> DepthEstimate:
     """Correct an estimate as one of this image."""
     return scale_by_mount(replace(given, input=image), mount)
@@ -335,7 +335,7 @@ def test_a_file_holds_the_digits_that_are_the_same_in_every_run(tmp_path: Path) 
     written: list[bytes] = []
     for changed in (0.0, 1e-13):
         again = replace(ground, **{k: v * (1 + changed) for k, v in vars(ground).items()})
-        image = StereoInput(name="a", left=torch.zeros(3, 4, 5), right=None, camera=None)
+        image = DepthInput(name="a", left=torch.zeros(3, 4, 5), right=None, camera=None)
         found = DepthEstimate(
             input=image, disparity_px=torch.ones(4, 5), depth_m=None, ground=again
         )

@@ -24,7 +24,7 @@ from depthpose.depth.stereo import (
     move_views,
 )
 from depthpose.depth.stereo.light_layers import correlation_volume, unit_groups
-from depthpose.depth.types import Match, StereoInput
+from depthpose.depth.types import DepthInput, Match
 
 needs_weights = pytest.mark.skipif(
     not (SHIPPED / "default.safetensors").is_file(), reason="no weights ship yet"
@@ -115,7 +115,7 @@ def test_black_borders_say_nothing_about_a_pair() -> None:
 def test_a_pair_is_matched_wherever_its_disparities_lie(near_px: int, far_px: int) -> None:
     left, right, truth_px = planes(near_px, far_px, width=640)
     net = FakestereoNet(matcher(), with_check=False)
-    pair = StereoInput(name="planes", left=left, right=right, camera=None)
+    pair = DepthInput(name="planes", left=left, right=right, camera=None)
     found = net.estimate_input(pair)
     is_seen = truth_px <= torch.arange(640)
     is_seen[:, :320] &= torch.arange(320) >= far_px
@@ -163,7 +163,7 @@ def test_a_search_takes_no_more_memory_than_usual() -> None:
 def test_what_lies_beyond_the_search_is_named_and_has_no_confidence() -> None:
     left, right, truth_px = planes(250, 16, width=640)
     net = FakestereoNet(matcher(60.0), with_check=False)
-    pair = StereoInput(name="planes", left=left, right=right, camera=rig(640))
+    pair = DepthInput(name="planes", left=left, right=right, camera=rig(640))
     found = net.estimate_input(pair)
     # At the camera's usual size a search holds more than what was asked for, but not 250 px.
     assert "disparities beyond" in found.warning
@@ -179,7 +179,7 @@ def test_what_lies_beyond_the_search_is_named_and_has_no_confidence() -> None:
 def test_a_limit_within_the_search_counts(limit_px: float) -> None:
     """The search holds more than what is asked for, or all of it: a strip of 180, a wall of 120."""
     left, right, truth_px = planes(180, 120, width=640)
-    pair = StereoInput(name="planes", left=left, right=right, camera=rig(640))
+    pair = DepthInput(name="planes", left=left, right=right, camera=rig(640))
     free = FakestereoNet(matcher(), with_check=False).estimate_input(pair)
     found = FakestereoNet(matcher(limit_px), with_check=False).estimate_input(pair)
     assert free.warning == ""
@@ -198,7 +198,7 @@ def test_a_pair_is_warned_of_without_a_confidence_too(with_confidence: bool) -> 
     left, right, _ = planes(250, 16, width=640)
     config = MatcherConfig(max_disparity_px=60.0, with_confidence=with_confidence)
     net = FakestereoNet.load("default", config=config, use="pairs", with_check=False)
-    found = net.estimate_input(StereoInput(name="planes", left=left, right=right, camera=rig(640)))
+    found = net.estimate_input(DepthInput(name="planes", left=left, right=right, camera=rig(640)))
     assert (found.confidence is not None) == with_confidence
     assert "disparities beyond 60 px" in found.warning
 
@@ -279,7 +279,7 @@ def test_principal_points_apart_move_the_search() -> None:
     left, right, truth_px = planes(20, -25, width=320)
     net = FakestereoNet(matcher(), with_check=False)
     camera: Camera = rig(320, apart_px=30.0)
-    pair = StereoInput(name="apart", left=left, right=right, camera=camera)
+    pair = DepthInput(name="apart", left=left, right=right, camera=camera)
     found = net.estimate_input(pair)
     is_wall = truth_px < 0
     is_wall[:, 110:160] = False

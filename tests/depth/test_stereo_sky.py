@@ -37,7 +37,7 @@ from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.stereo_task import validate_pairs
 from depthpose.depth.triangulation import estimate_from_pair
-from depthpose.depth.types import DepthEstimate, Match, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput, Match
 from depthpose.depth.weights import DepthWeights
 
 PLAIN = replace(SMALL, with_sky=False)
@@ -206,7 +206,7 @@ def test_an_estimate_has_no_depth_in_the_sky(apart_px: float) -> None:
 
 def test_a_few_pixels_of_sky_are_none() -> None:
     """They keep what was matched; in a garage they were infinitely far."""
-    pair = StereoInput(name="a", left=torch.rand(3, 100, 100), right=None, camera=rig(100, 100))
+    pair = DepthInput(name="a", left=torch.rand(3, 100, 100), right=None, camera=rig(100, 100))
     is_sky = torch.zeros(100, 100, dtype=torch.bool)
     is_sky[0, :15] = True
     match = Match(disparity_px=torch.full((100, 100), 4.0), is_sky=is_sky)
@@ -293,7 +293,7 @@ def test_a_lamp_that_is_no_sky_has_no_confidence_of_a_sky() -> None:
     is_sky[50, 40:50] = True
     confidence = torch.where(is_sky, 0.95, 0.1)
     match = Match(disparity_px=torch.full((100, 100), 8.0), confidence=confidence, is_sky=is_sky)
-    pair = StereoInput(name="a", left=image, right=image, camera=rig(100, 100))
+    pair = DepthInput(name="a", left=image, right=image, camera=rig(100, 100))
     found = estimate_from_pair(pair, match)
     assert found.is_sky is not None
     assert found.confidence is not None

@@ -12,7 +12,7 @@ from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import resize_image
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthetic import kitti_rig, make_street, render_scene
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 
 ALLOWED = 0.05
 """Median relative difference: at another size, and where the street is seen half as much again to
@@ -32,7 +32,7 @@ def depth_m(net: FakestereoNet, camera: StereoRig) -> Tensor:
     config = StreetsConfig(seed=9, jpeg_share=0.0, rectification_error_px=0.0)
     frame = render_scene(make_street((9, 2)), camera, config, (9, 2))
     estimate = net.estimate_input(
-        StereoInput(name="street", left=frame.left, right=None, camera=camera)
+        DepthInput(name="street", left=frame.left, right=None, camera=camera)
     )
     assert estimate.depth_m is not None
     return estimate.depth_m

@@ -10,7 +10,7 @@ from depthpose.core.camera import Camera
 from depthpose.depth.config import Speed
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthesis import SelectionSynthesiser, ViewEstimate, average_sizes
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 
 
 def two_sizes(plane: int, speed: Speed = "fine") -> FakestereoNet:
@@ -67,14 +67,14 @@ def test_a_larger_size_needs_the_pixels_along_both_sides(
 ) -> None:
     K = torch.diag(torch.tensor([*focal_px, 1.0], dtype=torch.float64))
     camera = Camera(width=size[0], height=size[1], K=K)
-    image = StereoInput(name="a", left=torch.rand(3, size[1], size[0]), right=None, camera=camera)
+    image = DepthInput(name="a", left=torch.rand(3, size[1], size[0]), right=None, camera=camera)
     assert two_sizes(3).virtual_sizes(image) == sizes
 
 
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float64])
 def test_an_image_of_other_numbers_is_taken(kind: torch.dtype) -> None:
     camera = Camera(width=192, height=128, K=torch.diag(torch.tensor([240.0, 240.0, 1.0]).double()))
-    image = StereoInput(name="a", left=torch.rand(3, 128, 192).to(kind), right=None, camera=camera)
+    image = DepthInput(name="a", left=torch.rand(3, 128, 192).to(kind), right=None, camera=camera)
     found = two_sizes(3).estimate_input(image)
     assert found.depth_m is not None
     assert found.depth_m.dtype == torch.float32

@@ -10,7 +10,7 @@ from depthpose import FakestereoNet
 from depthpose.core.camera import StereoRig
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.depth.triangulation import estimate_from_pair, estimate_from_virtual
-from depthpose.depth.types import Match, StereoInput
+from depthpose.depth.types import DepthInput, Match
 from depthpose.depth.visible import find_blank_borders, measure_texture
 
 H, W = 96, 160
@@ -123,7 +123,7 @@ def test_a_pair_has_no_depth_where_there_is_no_picture(change: Callable[[Tensor]
     scene = torch.nn.functional.pad(noise(), (8, 0, 0, 0))
     left, right = change(scene[..., :W]), change(scene[..., 8:])
     net = FakestereoNet(CallableMatcher(lambda *_: torch.full((H, W), 8.0)), with_check=False)
-    found = net.estimate_input(StereoInput(name="x", left=left, right=right, camera=rig()))
+    found = net.estimate_input(DepthInput(name="x", left=left, right=right, camera=rig()))
     blank = find_blank_borders(left)
     assert found.depth_m is not None
     assert bool(found.depth_m[blank].isnan().all())
@@ -138,7 +138,7 @@ def test_the_confidence_of_a_plain_wall_and_of_what_the_right_view_lacks_is_0() 
     sky = torch.zeros(H, W, dtype=torch.bool)
     sky[20:70, 60:120] = True
     match = Match(disparity_px=torch.full((H, W), 8.0), confidence=torch.ones(H, W), is_sky=sky)
-    found = estimate_from_pair(StereoInput(name="x", left=left, right=right, camera=rig()), match)
+    found = estimate_from_pair(DepthInput(name="x", left=left, right=right, camera=rig()), match)
     assert found.confidence is not None
     assert float(found.confidence[30:60, 70:110].max()) == 0
     assert float(found.confidence[:10, 60:].min()) == 1
@@ -152,7 +152,7 @@ def test_plain_sky_of_one_image_may_be_a_wall_and_depth_beside_it_keeps_its_conf
     sky = torch.zeros(H, W, dtype=torch.bool)
     sky[:50] = True
     match = Match(disparity_px=torch.full((H, W), 8.0), confidence=torch.ones(H, W), is_sky=sky)
-    seen = StereoInput(name="x", left=image, right=None, camera=rig())
+    seen = DepthInput(name="x", left=image, right=None, camera=rig())
     found = estimate_from_virtual(seen, match, image, 0.5)
     assert found.confidence is not None
     assert float(found.confidence[30:50, 70:110].max()) == 0

@@ -14,7 +14,7 @@ from tests.test_cli_engine import make_home
 
 from depthpose.core.camera import write_camera
 from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image
-from depthpose.depth.types import StereoSample
+from depthpose.depth.types import DepthSample
 from depthpose.depth.weights import write_depth_weights
 from depthpose.pose.datasets import write_bop_models
 from depthpose.pose.networks.fcn import ResNet18
@@ -138,7 +138,7 @@ def make_inputs(home: Path) -> Path:
     return home
 
 
-def write_street(folder: Path, street: StereoSample) -> None:
+def write_street(folder: Path, street: DepthSample) -> None:
     """Write two pairs with depth in KITTI's frame."""
     assert street.input.right is not None
     assert street.input.camera is not None

@@ -24,7 +24,7 @@ from depthpose.core.files import write_depth_png
 from depthpose.core.rigid import Rigid
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import Streets
-from depthpose.depth.types import StereoSample
+from depthpose.depth.types import DepthSample
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import make_model
 from depthpose.pose.search import nothing_found
@@ -37,7 +37,7 @@ FRAME_ID, STAMP = "left_camera_optical", (1700000000, 123456789)
 
 
 @pytest.fixture(scope="module")
-def street() -> StereoSample:
+def street() -> DepthSample:
     return Streets(StreetsConfig(seed=771, scale=0.5, jpeg_share=0.0))[0]
 
 
@@ -47,14 +47,14 @@ def ros2() -> Any:  # noqa: ANN401
     return types.get_typestore(types.Stores.ROS2_JAZZY)
 
 
-def rig_of_street(street: StereoSample) -> StereoRig:
+def rig_of_street(street: DepthSample) -> StereoRig:
     rig = street.input.camera
     assert isinstance(rig, StereoRig)
     return rig
 
 
 @pytest.fixture(scope="module")
-def recorded(street: StereoSample, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def recorded(street: DepthSample, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The messages of a pair, out of a real bag: serialised, written, read and parsed again."""
     bags, store = pytest.importorskip("rosbags.rosbag2"), ros2()
     kinds = store.types
@@ -90,13 +90,13 @@ def recorded(street: StereoSample, tmp_path_factory: pytest.TempPathFactory) -> 
         }
 
 
-def pictures(street: StereoSample) -> list[torch.Tensor]:
+def pictures(street: DepthSample) -> list[torch.Tensor]:
     assert street.input.right is not None
     return [(v * 255).round().byte() for v in (street.input.left, street.input.right)]
 
 
 def test_recorded_pairs_give_the_depth_of_the_estimator(
-    street: StereoSample, recorded: dict[str, Any]
+    street: DepthSample, recorded: dict[str, Any]
 ) -> None:
     net, (left, right) = FakestereoNet.load(matcher="sgbm"), pictures(street)
     topics = [f"/{s}/{t}" for t in ("image_rect", "camera_info") for s in ("left", "right")]
@@ -123,7 +123,7 @@ def test_of_a_pair_that_shows_too_little_a_warning_is_given(recorded: dict[str, 
 
 
 def test_recorded_images_give_the_depth_of_the_estimator(
-    street: StereoSample, recorded: dict[str, Any]
+    street: DepthSample, recorded: dict[str, Any]
 ) -> None:
     net = FakestereoNet.load("default", allow_ood=True)
     rig = rig_of_street(street)
@@ -143,7 +143,7 @@ def test_recorded_images_give_the_depth_of_the_estimator(
     assert np.nanmedian(depth_of(higher)) > 1.1 * np.nanmedian(expected)
 
 
-def test_the_answer_is_a_message_of_ros(street: StereoSample, recorded: dict[str, Any]) -> None:
+def test_the_answer_is_a_message_of_ros(street: DepthSample, recorded: dict[str, Any]) -> None:
     store = ros2()
     topics = [f"/{s}/{t}" for t in ("image_rect", "camera_info") for s in ("left", "right")]
     plain = DepthFromPair(FakestereoNet.load(matcher="sgbm"))(*(recorded[t] for t in topics))
@@ -195,14 +195,14 @@ class KnowsPose:
         return [self.estimate(mask=mask == k, object=object) for k in np.unique(mask[mask > 0])]
 
 
-def depth_messages(street: StereoSample, recorded: dict[str, Any]) -> tuple[Any, Any]:
+def depth_messages(street: DepthSample, recorded: dict[str, Any]) -> tuple[Any, Any]:
     topics = [f"/{s}/{t}" for t in ("image_rect", "camera_info") for s in ("left", "right")]
     depth = DepthFromPair(FakestereoNet.load(matcher="sgbm"))(*(recorded[t] for t in topics))
     return depth, recorded["/left/camera_info"]
 
 
 def test_poses_bear_the_depths_stamp_and_a_refusal_says_why(
-    street: StereoSample, recorded: dict[str, Any]
+    street: DepthSample, recorded: dict[str, Any]
 ) -> None:
     depth, info = depth_messages(street, recorded)
     net: Any = KnowsPose()
@@ -301,7 +301,7 @@ def poses_node(monkeypatch: pytest.MonkeyPatch, **parameters: object) -> Any:  #
 
 
 def test_the_node_of_poses_publishes_what_others_expect(
-    street: StereoSample, recorded: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    street: DepthSample, recorded: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     base = "0 -1 0 0.5 1 0 0 0 0 0 1 2 0 0 0 1"
     node = poses_node(monkeypatch, base_from_camera=base, base_frame="world")
@@ -332,7 +332,7 @@ def test_the_node_of_poses_publishes_what_others_expect(
 
 
 def test_the_node_of_poses_searches_before_an_empty_frame(
-    street: StereoSample,
+    street: DepthSample,
     recorded: dict[str, Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -357,7 +357,7 @@ def test_the_node_of_poses_searches_before_an_empty_frame(
 
 
 def test_the_service_answers_one_image(
-    street: StereoSample, recorded: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    street: DepthSample, recorded: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = poses_node(monkeypatch)
     depth, info = depth_messages(street, recorded)

@@ -18,7 +18,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.depth.datasets import Dataset, list_truth_kinds, read_true_depth
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.types import DepthEstimate, Map, StereoInput, View
+from depthpose.depth.types import DepthEstimate, DepthInput, Map, View
 
 _CANONICAL_FOCAL_PX = 721.5377
 """Rows are counted in a camera of this focal length (KITTI's), centred at its principal point."""
@@ -80,20 +80,20 @@ class RowDepthBaseline:
         rows = np.arange(_ROWS)
         return cls(1 / np.interp(rows, rows[has_truth], 1 / median_m[has_truth]))
 
-    def estimate_input(self, pair: StereoInput) -> DepthEstimate:
+    def estimate_input(self, depth_input: DepthInput) -> DepthEstimate:
         """Estimate the depth of every pixel as that of its row.
 
         Raises:
             InputError: the input has no rig.
         """
-        rig = _require_rig(pair)
-        height, width = pair.left.shape[1:]
+        rig = _require_rig(depth_input)
+        height, width = depth_input.left.shape[1:]
         rows = _convert_to_canonical_rows(np.arange(height), rig)
         inverse = np.interp(rows, np.arange(_ROWS), 1 / self.depth_m)
         row_depth_m = torch.from_numpy(1 / inverse).float()
         depth_m = row_depth_m[:, None].expand(height, width).contiguous()
         disparity_px = disparity_from_depth(depth_m, rig)
-        return DepthEstimate(input=pair, depth_m=depth_m, disparity_px=disparity_px)
+        return DepthEstimate(input=depth_input, depth_m=depth_m, disparity_px=disparity_px)
 
 
 def _weigh_depths(
@@ -160,15 +160,15 @@ class NearestImageBaseline:
             thumbnails.append(_make_thumbnail(read_image(left_path)))
         return cls(dataset, indices, torch.stack(thumbnails))
 
-    def estimate_input(self, pair: StereoInput) -> DepthEstimate:
+    def estimate_input(self, depth_input: DepthInput) -> DepthEstimate:
         """Estimate the depth of the left image as that of the most similar training image.
 
         Raises:
             InputError: the input has no rig.
         """
-        rig = _require_rig(pair)
-        height, width = pair.left.shape[1:]
-        correlations = self.thumbnails @ _make_thumbnail(pair.left)
+        rig = _require_rig(depth_input)
+        height, width = depth_input.left.shape[1:]
+        correlations = self.thumbnails @ _make_thumbnail(depth_input.left)
         nearest = self.indices[int(correlations.argmax())]
         nearest_true_m = read_true_depth(self.dataset, nearest)
         nearest_rig = self.dataset.read_rig(nearest)
@@ -182,7 +182,7 @@ class NearestImageBaseline:
         nearest_focal = float(nearest_rig.K[0, 0]) / nearest_rig.width
         depth_m = focal / nearest_focal / inverse
         disparity_px = disparity_from_depth(depth_m, rig)
-        return DepthEstimate(input=pair, depth_m=depth_m, disparity_px=disparity_px)
+        return DepthEstimate(input=depth_input, depth_m=depth_m, disparity_px=disparity_px)
 
 
 def fill_by_pyramid(values: Map) -> Map:
@@ -209,18 +209,18 @@ def _make_thumbnail(image: View) -> Float[Tensor, " d"]:
     return centred / centred.norm().clamp(min=1e-9)
 
 
-def _require_rig(pair: StereoInput) -> StereoRig:
-    """Return the rig of a pair.
+def _require_rig(depth_input: DepthInput) -> StereoRig:
+    """Return the rig of an input.
 
     Raises:
         InputError: it has none.
     """
-    if not isinstance(pair.camera, StereoRig):
+    if not isinstance(depth_input.camera, StereoRig):
         raise InputError(
-            f"{pair.name}: has no rig, and this baseline's depth is measured as disparity; give a "
-            "camera with baseline_m"
+            f"{depth_input.name}: has no rig, and this baseline's depth is measured as disparity; "
+            "give a camera with baseline_m"
         )
-    return pair.camera
+    return depth_input.camera
 
 
 def _make_no_truth_error(dataset: Dataset) -> InputError:

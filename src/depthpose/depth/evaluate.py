@@ -24,7 +24,7 @@ from depthpose.depth.protocols import (
     has_truth,
     prepare_frame,
 )
-from depthpose.depth.types import DepthError, DepthEstimate, Map, StereoInput
+from depthpose.depth.types import DepthError, DepthEstimate, DepthInput, Map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -379,7 +379,7 @@ def read_frame_result(
     return estimate, DepthError(error=error, is_disparity=rule.is_disparity, true_depth_m=true_m)
 
 
-def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
+def measure_image_confidence(net: FakestereoNet, images: Iterable[DepthInput]) -> list[float]:
     """Estimate images, and return the ``DepthEstimate.image_confidence`` of each, 0..1.
 
     Raises:

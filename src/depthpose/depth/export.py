@@ -19,7 +19,7 @@ from depthpose.depth.graphs import image_graph, pair_graph
 from depthpose.depth.stereo import LightStereo, Matcher, StereoNetwork, match_in_usual_range
 from depthpose.depth.synthesis import make_synthesiser
 from depthpose.depth.triangulation import estimate_from_pair
-from depthpose.depth.types import DepthEstimate, StereoInput, View
+from depthpose.depth.types import DepthEstimate, DepthInput, View
 from depthpose.depth.weights import DepthWeights, make_matcher
 
 _LIMITS = {
@@ -133,7 +133,7 @@ def _estimate_as_graph(
     matcher: Matcher, left: View, right: View, rig: StereoRig | None
 ) -> DepthEstimate:
     """Estimate depth of a pair as a graph does, which does not measure its disparities."""
-    pair = StereoInput(name="case", left=left, right=right, camera=rig)
+    pair = DepthInput(name="case", left=left, right=right, camera=rig)
     return estimate_from_pair(pair, match_in_usual_range(matcher, left, right, rig))
 
 
@@ -156,7 +156,7 @@ def _make_image_cases(weights: DepthWeights) -> Iterator[Case]:
     for size in _CASE_SIZES:
         images, _, camera = _make_scenes(size, focal_px, with_sky=has_sky)
         inputs = {"image": images.numpy(), "K": camera.K.numpy()}
-        views = (StereoInput(name="case", left=view, right=None, camera=camera) for view in images)
+        views = (DepthInput(name="case", left=view, right=None, camera=camera) for view in images)
         estimates = [net.estimate_input(view) for view in views]
         case = _make_case(inputs, estimates, outputs)
         is_compared = case.expected["disparity_px"] >= _MIN_COMPARED_PX

@@ -17,7 +17,7 @@ from depthpose.depth.config import Settings
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet, check_rectified_pair
-from depthpose.depth.types import Map, StereoInput
+from depthpose.depth.types import DepthInput, Map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +127,7 @@ def _is_labelled(folder: Path, name: str) -> bool:
     return is_whole(folder, name, [f"disp_occ/{name}.png"])
 
 
-def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Map:
+def label_pair(net: FakestereoNet, pair: DepthInput, config: LabelConfig) -> Map:
     """Estimate the disparity of the left view [px] where it is sure enough to serve as truth.
 
     The pair is matched from left to right and from right to left. NaN where the two disagree, in

@@ -20,7 +20,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.ground import fit_ground
 from depthpose.depth.horizon import Angles, find_angles
-from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput, Ground, Map
 
 _MAX_TILT_DIFFERENCE_DEG = 8.0
 """Largest difference of the user's tilt from that of the road in the map, which was off by at most
@@ -75,7 +75,7 @@ class MountFilter:
 
 def find_mount(
     map_ground: Ground,
-    image: StereoInput,
+    image: DepthInput,
     before: Ground | None = None,
     network: GeneratorConfig | SelectionConfig = _DEFAULT_NETWORK,
 ) -> Ground:

@@ -20,14 +20,14 @@ from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.depth.config import COLOR_RANGE_M
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
-from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput, Ground, Map
 
 
 @runtime_checkable
 class Estimator(Protocol):
     """Anything that estimates depth: :class:`FakestereoNet`, a baseline, or your own method."""
 
-    def estimate_input(self, pair: StereoInput, /) -> DepthEstimate:
+    def estimate_input(self, depth_input: DepthInput, /) -> DepthEstimate:
         """Estimate depth of one input, whose images are in memory."""
         ...
 
@@ -228,7 +228,7 @@ def read_part(folder: Path, name: str, ending: str) -> Float[Tensor, "*c h w"] |
     return files.read_image(path) if is_png else files.read_map(path)
 
 
-def read_estimate(folder: Path, depth_input: StereoInput) -> DepthEstimate:
+def read_estimate(folder: Path, depth_input: DepthInput) -> DepthEstimate:
     """Read the estimate of an input that :func:`write_estimate` wrote.
 
     A rig of the input makes depth of the disparity where no depth was written.
@@ -274,17 +274,17 @@ def read_ground(folder: Path, name: str) -> Ground | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthResults(Results[StereoInput, DepthEstimate]):
+class DepthResults(Results[DepthInput, DepthEstimate]):
     """Results of a run of estimates: files of one folder, as :func:`write_estimate` names them."""
 
     folder: Path  #: claimed before (:func:`depthpose.core.run_folder.claim_folder`)
     options: OutputOptions = OutputOptions()
 
-    def is_finished(self, job: Job[StereoInput]) -> bool:
+    def is_finished(self, job: Job[DepthInput]) -> bool:
         """Whether an earlier run wrote the whole estimate, with a cloud if there shall be one."""
         return is_finished(self.folder, job.name, with_cloud=self.options.cloud_m is not None)
 
-    def store(self, job: Job[StereoInput], result: DepthEstimate) -> None:
+    def store(self, job: Job[DepthInput], result: DepthEstimate) -> None:
         """Write the files of an estimate, and record that it is finished."""
         written = write_estimate(self.folder, result, self.options)
         note_result(self.folder, job.name, written)
@@ -292,7 +292,7 @@ class DepthResults(Results[StereoInput, DepthEstimate]):
 
 def estimate_missing_depth(
     net: Estimator,
-    jobs: Sequence[Job[StereoInput]],
+    jobs: Sequence[Job[DepthInput]],
     folder: Path,
     settings: dict[str, Any],
     sources: Mapping[str, Path | Sequence[Path]],
@@ -314,7 +314,7 @@ def estimate_missing_depth(
     claim_folder(folder, settings, names)
     claim_names(folder, sources, is_finished=partial(is_finished, folder))
 
-    def estimate_many(pairs: Sequence[StereoInput]) -> list[DepthEstimate]:
+    def estimate_many(pairs: Sequence[DepthInput]) -> list[DepthEstimate]:
         return [net.estimate_input(pair) for pair in pairs]
 
     for outcome in run_jobs(jobs, estimate_many, DepthResults(folder=folder)):

@@ -12,7 +12,7 @@ from depthpose.depth.disparity import (
     disparity_from_depth,
     warp_right_to_left,
 )
-from depthpose.depth.types import DepthEstimate, Mask, Match, StereoInput, View
+from depthpose.depth.types import DepthEstimate, DepthInput, Mask, Match, View
 from depthpose.depth.visible import find_blank_borders, measure_texture
 
 _MIN_SKY_SHARE = 0.002
@@ -25,7 +25,7 @@ def join_warnings(*warnings: str) -> str:
     return "; ".join(warning for warning in warnings if warning)
 
 
-def estimate_from_pair(pair: StereoInput, match: Match) -> DepthEstimate:
+def estimate_from_pair(pair: DepthInput, match: Match) -> DepthEstimate:
     """Make the estimate of a rectified pair from its match; metres where the camera has a baseline.
 
     The confidence is 0 where either view is blank (``find_blank_borders`` of ``depth/visible.py``),
@@ -46,7 +46,7 @@ def estimate_from_pair(pair: StereoInput, match: Match) -> DepthEstimate:
 
 
 def estimate_from_virtual(
-    image: StereoInput, match: Match, right: View, virtual_baseline_m: float
+    image: DepthInput, match: Match, right: View, virtual_baseline_m: float
 ) -> DepthEstimate:
     """Make the estimate of one image from its match with a synthesised right view.
 
@@ -71,7 +71,7 @@ def estimate_from_virtual(
     return replace(triangulate(match, image, rig), right=right)
 
 
-def triangulate(match: Match, depth_input: StereoInput, rig: StereoRig | None) -> DepthEstimate:
+def triangulate(match: Match, depth_input: DepthInput, rig: StereoRig | None) -> DepthEstimate:
     """Make the estimate of an image from its match by triangulation.
 
     Where the image is blank there is neither disparity nor depth (NaN), and no confidence. The sky

@@ -20,7 +20,7 @@ Mask = Bool[Tensor, "h w"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StereoInput:
+class DepthInput:
     """Everything that a depth estimate may use; it holds no truth, so none can leak."""
 
     name: str  #: name of the files that are made from this input
@@ -32,7 +32,7 @@ class StereoInput:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StereoTruth:
+class DepthTruth:
     """Truth of a sample; None for a map that the dataset does not have, NaN for unknown pixels."""
 
     disparity_px: Map | None = None  #: disparity of the left image
@@ -46,11 +46,11 @@ class StereoTruth:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StereoSample:
+class DepthSample:
     """One sample of a dataset."""
 
-    input: StereoInput  #: what an estimator may use
-    truth: StereoTruth  #: what its estimate is compared with
+    input: DepthInput  #: what an estimator may use
+    truth: DepthTruth  #: what its estimate is compared with
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,7 +110,7 @@ class Ground:
 class DepthEstimate:
     """Depth of one left image."""
 
-    input: StereoInput  #: what it was estimated from, with its colours and camera
+    input: DepthInput  #: what it was estimated from, with its colours and camera
     #: metres along the optical axis; NaN where disparity is invalid, and in the sky. None without a
     #: rig.
     depth_m: Map | None

@@ -16,7 +16,7 @@ from depthpose.core.draw import (
 )
 from depthpose.core.files import PointCloud
 from depthpose.depth.config import COLOR_RANGE_M
-from depthpose.depth.types import DepthError, DepthEstimate, Map, StereoInput
+from depthpose.depth.types import DepthError, DepthEstimate, DepthInput, Map
 from depthpose.report.page import (
     Drawing,
     Layer,
@@ -59,9 +59,9 @@ def make_depth_section(
         with_image: show the left image too.
     """
     _, far_m = range_m
-    pair = estimate.input
+    depth_input = estimate.input
     grey_meaning = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
-    pictures = [Drawing(image=pair.left, caption="image")] if with_image else []
+    pictures = [Drawing(image=depth_input.left, caption="image")] if with_image else []
     if estimate.depth_m is None:
         disparity = Drawing(
             image=draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky),
@@ -77,7 +77,7 @@ def make_depth_section(
         )
         pictures.append(depth)
     if error is not None:
-        pictures += _draw_errors(pair, error, range_m)
+        pictures += _draw_errors(depth_input, error, range_m)
     if estimate.confidence is not None:
         confidence = Drawing(
             image=draw_share(1 - estimate.confidence),
@@ -89,17 +89,17 @@ def make_depth_section(
         pictures.append(Drawing(image=estimate.right, caption="right view as drawn"))
 
     scenes: list[Scene] = []
-    if estimate.depth_m is not None and pair.camera is not None:
+    if estimate.depth_m is not None and depth_input.camera is not None:
         scene = make_depth_scene(estimate, far_m, f"{title}: the cloud")
         if error is not None and error.true_depth_m is not None:
-            scene = _add_truth(scene, error.true_depth_m, pair.camera, far_m)
+            scene = _add_truth(scene, error.true_depth_m, depth_input.camera, far_m)
         scenes.append(scene)
     facts = list_depth_facts(estimate)
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
 
 
 def _draw_errors(
-    pair: StereoInput, error: DepthError, range_m: tuple[float, float]
+    depth_input: DepthInput, error: DepthError, range_m: tuple[float, float]
 ) -> list[Drawing]:
     """Draw the true depth, if it is known in metres, and the error of each pixel.
 
@@ -112,7 +112,9 @@ def _draw_errors(
     drawings: list[Drawing] = []
     if error.true_depth_m is not None:
         if is_sparse:
-            image = draw_points(pair.left, error.true_depth_m, far_m, _POINT_RADIUS_PX, near_m)
+            image = draw_points(
+                depth_input.left, error.true_depth_m, far_m, _POINT_RADIUS_PX, near_m
+            )
         else:
             image = draw_depth(error.true_depth_m, near_m, far_m)
         color_bar = make_depth_color_bar(near_m, far_m)
@@ -127,7 +129,7 @@ def _draw_errors(
         noun = "depth error as a share of the truth"
         color_bar = make_rising_color_bar("depth error [%]", 100 * worst, has_more=True)
     if is_sparse:
-        image = draw_error_points(pair.left, error.error, worst, _POINT_RADIUS_PX)
+        image = draw_error_points(depth_input.left, error.error, worst, _POINT_RADIUS_PX)
     else:
         image = draw_share(1 - error.error / worst)  # no error is 1, the dark end of the colours
     caption = f"{noun}: dark is right, bright is wrong; {note}"
@@ -152,14 +154,14 @@ def list_depth_facts(estimate: DepthEstimate, focal_note: str = "") -> list[tupl
 
     ``focal_note``: text behind the focal length, such as where it is from.
     """
-    pair = estimate.input
-    camera = pair.camera
+    depth_input = estimate.input
+    camera = depth_input.camera
     depth_m = estimate.depth_m
-    height, width = pair.left.shape[1:]
+    height, width = depth_input.left.shape[1:]
     facts = [("size", f"{width} x {height} px")]
     if isinstance(camera, Camera):
         facts.append(("focal length", f"{float(camera.K[0, 0]):.1f} px{focal_note}"))
-    if pair.right is not None and isinstance(camera, StereoRig):
+    if depth_input.right is not None and isinstance(camera, StereoRig):
         facts.append(("baseline", f"{camera.baseline_m:g} m"))
 
     if depth_m is not None:
@@ -178,7 +180,7 @@ def list_depth_facts(estimate: DepthEstimate, focal_note: str = "") -> list[tupl
 
     if estimate.confidence is not None:
         facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
-        if pair.right is not None:
+        if depth_input.right is not None:
             sure_count = estimate.is_sure().sum()
             point_count = estimate.is_sure(0.0).sum().clamp(min=1)  # all that have depth
             unsure_share = 1 - float(sure_count / point_count)

@@ -13,7 +13,7 @@ from depthpose.core.draw import draw_depth, draw_points
 from depthpose.core.errors import InputError
 from depthpose.depth.evaluate import EvaluationRow
 from depthpose.depth.metrics import METRICS
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 from depthpose.report.page import Drawing, make_depth_color_bar
 
 _METRICS = tuple(name for name, metric in METRICS.items() if metric.of == "depth")
@@ -175,7 +175,7 @@ DEPTH_SCALE = (
 
 
 def draw_figure_2_5(
-    pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None, estimate: DepthEstimate
+    pair: DepthInput, lidar_m: Float[Tensor, "h w"] | None, estimate: DepthEstimate
 ) -> list[Drawing]:
     """Draw a column of figure 2-5: left, real right, predicted depth, predicted right, LiDAR.
 
@@ -197,7 +197,7 @@ def draw_figure_2_5(
 
 
 def draw_figure_2_1(
-    pair: StereoInput,
+    pair: DepthInput,
     lidar_m: Float[Tensor, "h w"] | None,
     mono: DepthEstimate,
     stereo: DepthEstimate,
@@ -261,7 +261,7 @@ def arrange_columns(
     return torch.cat([grid, bar], 1)
 
 
-def _draw_depth_panel(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Drawing:
+def _draw_depth_panel(caption: str, pair: DepthInput, estimate: DepthEstimate) -> Drawing:
     """Draw estimated depth, in the colours of every panel."""
     if estimate.depth_m is None:
         raise InputError(f"{pair.name}: a figure shows metres; give a camera with a baseline.")
@@ -270,7 +270,7 @@ def _draw_depth_panel(caption: str, pair: StereoInput, estimate: DepthEstimate) 
 
 
 def _draw_lidar_panels(
-    pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None, caption: str = "LiDAR"
+    pair: DepthInput, lidar_m: Float[Tensor, "h w"] | None, caption: str = "LiDAR"
 ) -> list[Drawing]:
     """Draw the LiDAR points over the left image; no panel without a scan."""
     if lidar_m is None:

@@ -16,7 +16,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import OutputOptions, write_estimate
 from depthpose.depth.stereo import NetworkMatcher
 from depthpose.depth.synthetic import Streets
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 from depthpose.report.depth import list_depth_facts, make_depth_scene
 from depthpose.report.page import make_depth_color_bar, make_rising_color_bar
 from depthpose.web.answer import (
@@ -46,18 +46,18 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
         InputError: a field or file is missing, wrong or too large.
     """
     start = time.perf_counter()
-    pair, focal_origin = _read_input(form)
+    depth_input, focal_origin = _read_input(form)
 
     # Refuse what cannot be drawn or matched, and what would take too long.
     near_m, far_m = _read_range(form)
-    if pair.right is not None and net.matcher is None:
+    if depth_input.right is not None and net.matcher is None:
         raise InputError(
             "the weights of this page take one image alone: remove the right image, or start "
             "'depthpose serve' with --weights that have a matcher"
         )
-    _refuse_large_inputs(pair, net)
+    _refuse_large_inputs(depth_input, net)
 
-    estimate = net.estimate_input(pair)
+    estimate = net.estimate_input(depth_input)
     seconds = time.perf_counter() - start
     assert estimate.depth_m is not None
 
@@ -65,10 +65,12 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     folder = form.folder / "results"
     folder.mkdir()
     write_estimate(folder, estimate, OutputOptions(range_m=(near_m, far_m), cloud_m=far_m))
-    write_image(folder / f"{pair.name}.input.jpg", pair.left)
+    write_image(folder / f"{depth_input.name}.input.jpg", depth_input.left)
     pictures = _list_pictures(estimate, (near_m, far_m))
     if estimate.confidence is not None:
-        write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - estimate.confidence))
+        write_image(
+            folder / f"{depth_input.name}.confidence.png", draw_share(1 - estimate.confidence)
+        )
     # The warning is in the sentence already.
     facts = list_depth_facts(estimate, focal_origin)
     facts = [(name, value) for name, value in facts if name != "warning"]
@@ -97,22 +99,22 @@ def _read_range(form: Form) -> tuple[float, float]:
     return near_m, far_m
 
 
-def _refuse_large_inputs(pair: StereoInput, net: FakestereoNet) -> None:
+def _refuse_large_inputs(depth_input: DepthInput, net: FakestereoNet) -> None:
     """Refuse images that the networks would take in too large a size.
 
     The size follows from the focal length: networks resize images to the one they know.
     """
-    assert pair.camera is not None
-    height, width = pair.left.shape[1:]
-    focal_px = float(pair.camera.K[0, 0])
+    assert depth_input.camera is not None
+    height, width = depth_input.left.shape[1:]
+    focal_px = float(depth_input.camera.K[0, 0])
 
     # Rows and columns as the generator takes one image, and as the matcher takes both.
     sizes: list[tuple[int, int]] = []
-    camera = pair.camera
+    camera = depth_input.camera
     is_matched = True
-    if pair.right is None and net.synthesiser is not None:
+    if depth_input.right is None and net.synthesiser is not None:
         config = net.synthesiser.config
-        sizes += net.virtual_sizes(pair)
+        sizes += net.virtual_sizes(depth_input)
         virtual_height, virtual_width = sizes[0]
         virtual_size = (virtual_width, virtual_height)
         camera = camera_of(config.virtual_focal_px, virtual_size) or camera
@@ -125,7 +127,7 @@ def _refuse_large_inputs(pair: StereoInput, net: FakestereoNet) -> None:
     rows, columns = max(sizes, key=math.prod)
     if (rows, columns) == (height, width) and rows * columns > _MAX_NETWORK_PIXELS:
         raise InputError(
-            f"{pair.name} has {width}x{height} pixels; these weights match pairs as "
+            f"{depth_input.name} has {width}x{height} pixels; these weights match pairs as "
             f"they are, and this page computes {_MAX_NETWORK_PIXELS / 1e6:g} million at most; "
             "scale both images down, and the focal length with them, or use the command line"
         )
@@ -137,11 +139,11 @@ def _refuse_large_inputs(pair: StereoInput, net: FakestereoNet) -> None:
         )
 
 
-def _read_input(form: Form) -> tuple[StereoInput, str]:
+def _read_input(form: Form) -> tuple[DepthInput, str]:
     """Read the picture or pair with its camera.
 
     Returns:
-        The pair, and words for the page on where its focal length is from; empty where the user
+        The input, and words for the page on where its focal length is from; empty where the user
         gave it.
     """
     path = form.require_file("image")
@@ -189,8 +191,8 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
         right_path = form.require_file("right")
         refuse_large(right_path.name, *image_size(right_path))
         right = read_image(right_path)
-    pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
-    return pair, origin
+    depth_input = DepthInput(name=path.stem, left=read_image(path), right=right, camera=camera)
+    return depth_input, origin
 
 
 def _list_pictures(estimate: DepthEstimate, range_m: tuple[float, float]) -> list[ShownPicture]:

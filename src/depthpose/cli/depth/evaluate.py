@@ -34,7 +34,7 @@ from depthpose.depth.evaluate import (
 from depthpose.depth.metrics import METRICS, RANKING
 from depthpose.depth.predictions import estimate_missing_depth, is_finished
 from depthpose.depth.protocols import PROTOCOLS, Protocol, has_truth
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 from depthpose.report import page
 from depthpose.report.depth import make_depth_section
 from depthpose.report.page import Section
@@ -76,7 +76,7 @@ def predict_depth_of_dataset(
             usable.append(index)
             sources[frame.name] = frame.list_input_files(with_right=method.with_right)
 
-    jobs: list[Job[StereoInput]] = []
+    jobs: list[Job[DepthInput]] = []
     for index in process.share_of(usable):
         read = partial(_read_views, dataset, index, with_right=method.with_right)
         jobs.append(Job(name=dataset.frames[index].name, read=read))
@@ -88,7 +88,7 @@ def predict_depth_of_dataset(
     return method_folder
 
 
-def _read_views(dataset: Dataset, index: int, *, with_right: bool) -> StereoInput:
+def _read_views(dataset: Dataset, index: int, *, with_right: bool) -> DepthInput:
     """Read the views of a frame that a method may see: of depth of one image the left alone."""
     pair = dataset.read_input(index)
     return pair if with_right else replace(pair, right=None)

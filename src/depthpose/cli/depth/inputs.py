@@ -34,7 +34,7 @@ from depthpose.core.files import (
 from depthpose.core.files.disk import find_partners, refuse_equal_stems
 from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.core.runner import Job
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 
 IMAGES = InputFormat(roles=("image",), suffixes=LISTED_SUFFIXES)
 PAIRS = InputFormat(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
@@ -191,7 +191,7 @@ class InputReader:
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     files: InputFormat = IMAGES  #: what an input consists of
 
-    def make_jobs(self, files: Sequence[Path]) -> Iterator[Job[StereoInput]]:
+    def make_jobs(self, files: Sequence[Path]) -> Iterator[Job[DepthInput]]:
         """Make the job of an image or a pair, or the jobs of all frames of a video."""
         if not is_video(files[0]):
             name = files[0].stem
@@ -200,7 +200,7 @@ class InputReader:
         for name, frame in read_video(files[0]):
             yield Job(name=name, read=partial(self._make_input, name, frame))
 
-    def read_input(self, name: str, left: Path, right: Path | None = None) -> StereoInput:
+    def read_input(self, name: str, left: Path, right: Path | None = None) -> DepthInput:
         """Read an image or a pair.
 
         Raises:
@@ -210,7 +210,7 @@ class InputReader:
         depth_input = self._make_input(name, image)
         return depth_input if right is None else replace(depth_input, right=read_image(right))
 
-    def _make_input(self, name: str, image: Tensor) -> StereoInput:
+    def _make_input(self, name: str, image: Tensor) -> DepthInput:
         """Make the input of one image, with the camera of its size."""
         height, width = image.shape[1:]
         camera = camera_of(self.camera, (width, height))
@@ -219,7 +219,7 @@ class InputReader:
             camera = replace(camera, mount_height_m=self.scale.camera_height)
         if self.scale.camera_tilt is not None:
             camera = replace(camera, tilt_deg=self.scale.camera_tilt)
-        return StereoInput(name=name, left=image, right=None, camera=camera)
+        return DepthInput(name=name, left=image, right=None, camera=camera)
 
     def camera_settings(self) -> dict[str, Any]:
         """List the JSON values of the camera, and of the lengths that set the scale."""

@@ -10,7 +10,7 @@ from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import read_text
 from depthpose.depth.predictions import is_finished, read_estimate
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthInput
 from depthpose.report.depth import make_depth_section
 from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
 
@@ -74,7 +74,7 @@ def _read_warnings(names: Sequence[str], out: Path) -> Iterator[str]:
 
 def _read_shown(
     names_of: Mapping[tuple[Path, ...], Sequence[str]], reader: InputReader, shown: Collection[str]
-) -> Iterator[StereoInput]:
+) -> Iterator[DepthInput]:
     """Read the inputs of the shown results again; one that is unreadable by now is left out.
 
     ``names_of``: the names of the results of each image, pair or video, by its files.

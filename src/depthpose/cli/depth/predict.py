@@ -39,7 +39,7 @@ from depthpose.depth.predictions import (
     is_finished,
     read_ground,
 )
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 
 
 def predict_depth_of_files(
@@ -206,7 +206,7 @@ class DepthPredictor:
 
     def predict(
         self,
-        jobs: Iterable[Job[StereoInput]],
+        jobs: Iterable[Job[DepthInput]],
         total: int | None,
         label: str,
         mount: MountFilter | None = None,
@@ -246,7 +246,7 @@ class DepthPredictor:
         return names
 
     def _estimate_many(
-        self, inputs: Sequence[StereoInput], mount: MountFilter | None
+        self, inputs: Sequence[DepthInput], mount: MountFilter | None
     ) -> list[DepthEstimate | InputError]:
         """Estimate inputs together; ``mount``: of the camera, where all are frames of one."""
         net = self.method.estimator
@@ -335,7 +335,7 @@ class DepthWorker:
             output=self.output,
             out=out,
         )
-        jobs: list[Job[StereoInput]] = []
+        jobs: list[Job[DepthInput]] = []
         for sample in samples:
             read = partial(self.reader.read_input, sample.name, *sample.files)
             jobs.append(Job(name=sample.name, read=read))

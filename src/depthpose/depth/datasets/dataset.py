@@ -23,7 +23,7 @@ from depthpose.depth.datasets.frames import (
 from depthpose.depth.datasets.layouts import find_frames
 from depthpose.depth.datasets.packed import resolve_folder
 from depthpose.depth.disparity import depth_from_disparity
-from depthpose.depth.types import Map, StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import DepthInput, DepthSample, DepthTruth, Map
 
 _SHIPPED_SPLITS = ("eigen-train", "eigen-val", "eigen-test", "eigen-benchmark")
 """Splits that come as files: a line for each drive, with its frame numbers as ranges."""
@@ -138,20 +138,20 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __getitem__(self, index: int) -> StereoSample:
+    def __getitem__(self, index: int) -> DepthSample:
         """Read one sample: images, calibration and truth."""
-        return StereoSample(input=self.read_input(index), truth=self.read_truth(index))
+        return DepthSample(input=self.read_input(index), truth=self.read_truth(index))
 
-    def read_input(self, index: int) -> StereoInput:
+    def read_input(self, index: int) -> DepthInput:
         """Read images and calibration of a frame, without its truth."""
         frame = self.frames[index]
         left = read_image(frame.left)
         right = None if frame.right is None else read_image(frame.right)
         if frame.right is not None and right is not None:
             check_map_size(frame.right, right, (left.shape[2], left.shape[1]))
-        return StereoInput(name=frame.name, left=left, right=right, camera=read_frame_camera(frame))
+        return DepthInput(name=frame.name, left=left, right=right, camera=read_frame_camera(frame))
 
-    def read_truth(self, index: int) -> StereoTruth:
+    def read_truth(self, index: int) -> DepthTruth:
         """Read the true maps of a frame; :func:`read_lidar_depth` draws one of a LiDAR scan."""
         frame = self.frames[index]
         depth_m = None if frame.depth is None else read_depth(frame.depth)
@@ -161,7 +161,7 @@ class Dataset:
         for path, values in maps:
             if path is not None and values is not None:
                 check_map_size(path, values, image_size(frame.left))
-        return StereoTruth(disparity_px=disparity_px, depth_m=depth_m, is_sky=is_sky)
+        return DepthTruth(disparity_px=disparity_px, depth_m=depth_m, is_sky=is_sky)
 
     def read_rig(self, index: int) -> StereoRig | None:
         """Read the calibration of a frame; None where it has none, or one of a single camera."""

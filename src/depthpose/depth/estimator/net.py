@@ -37,13 +37,13 @@ from depthpose.depth.stereo import (
     SGBMMatcher,
 )
 from depthpose.depth.synthesis import Synthesiser, make_synthesiser
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 from depthpose.depth.weights import DepthWeights, Use, make_matcher, read_depth_weights
 
 
 def as_input(
     image: object, name: str, camera: AnyLens | None, *, with_exif: bool = True
-) -> StereoInput:
+) -> DepthInput:
     """Make the input of one image, without a right view.
 
     Args:
@@ -62,7 +62,7 @@ def as_input(
             message = f"{name}: a focal length of {lens:.0f} px, by its EXIF ({source})"
             warnings.warn(f"{message}; of a cropped picture it is another", Notice, stacklevel=3)
     size = (left.shape[2], left.shape[1])
-    return StereoInput(name=name, left=left, right=None, camera=camera_of(lens, size))
+    return DepthInput(name=name, left=left, right=None, camera=camera_of(lens, size))
 
 
 def _choose_matcher(
@@ -311,7 +311,7 @@ class FakestereoNet:
 
     @force_float32()
     def estimate_input(
-        self, depth_input: StereoInput, *, mount: MountFilter | None = None
+        self, depth_input: DepthInput, *, mount: MountFilter | None = None
     ) -> DepthEstimate:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does.
 
@@ -327,7 +327,7 @@ class FakestereoNet:
     @force_float32()
     def estimate_many(
         self,
-        images: Iterable[StereoInput] | Iterable[AnyPicture] | AnyPicture,
+        images: Iterable[DepthInput] | Iterable[AnyPicture] | AnyPicture,
         camera: AnyLens | None = None,
         *,
         focal_px: float | None = None,
@@ -361,7 +361,7 @@ class FakestereoNet:
         if batch < 1:
             raise InputError(f"batch is {batch}; take 1 or more images")
         lens = choose_lens(camera, focal_px, fov_deg)
-        is_single = isinstance(images, str | Path | Image.Image | StereoInput)
+        is_single = isinstance(images, str | Path | Image.Image | DepthInput)
         if is_single or (isinstance(images, np.ndarray | Tensor) and images.ndim < 4):
             images = [cast("AnyPicture", images)]
         sequence = cast("Iterable[object]", images)
@@ -381,9 +381,7 @@ class FakestereoNet:
     ) -> list[DepthEstimate | InputError]:
         """Read and estimate a batch of :meth:`estimate_many`: names, with pictures or inputs."""
         inputs = [
-            image
-            if isinstance(image, StereoInput)
-            else result_or_error(as_input, image, name, lens)
+            image if isinstance(image, DepthInput) else result_or_error(as_input, image, name, lens)
             for name, image in named
         ]
         readable = [item for item in inputs if not isinstance(item, InputError)]
@@ -392,7 +390,7 @@ class FakestereoNet:
 
     @force_float32()
     def estimate_batch(
-        self, inputs: Sequence[StereoInput], *, mount: MountFilter | None = None
+        self, inputs: Sequence[DepthInput], *, mount: MountFilter | None = None
     ) -> list[DepthEstimate | InputError]:
         """Estimate inputs in one call of the networks; where that fails, each by itself.
 
@@ -414,12 +412,12 @@ class FakestereoNet:
             for estimate in estimates
         ]
 
-    def _estimate_alone(self, depth_input: StereoInput) -> DepthEstimate:
+    def _estimate_alone(self, depth_input: DepthInput) -> DepthEstimate:
         """Estimate one input by the networks."""
         (estimate,) = self._estimate_by_networks([depth_input])
         return estimate
 
-    def _estimate_by_networks(self, inputs: Sequence[StereoInput]) -> list[DepthEstimate]:
+    def _estimate_by_networks(self, inputs: Sequence[DepthInput]) -> list[DepthEstimate]:
         """Estimate inputs in order, without a correction by the mount.
 
         Raises:
@@ -439,7 +437,7 @@ class FakestereoNet:
             )
         return estimates
 
-    def _estimate_pair(self, pair: StereoInput) -> DepthEstimate:
+    def _estimate_pair(self, pair: DepthInput) -> DepthEstimate:
         """Estimate a pair by the matcher.
 
         Raises:
@@ -480,7 +478,7 @@ class FakestereoNet:
         synthesiser = self._require_synthesiser(estimate.input.name)
         return scale_by_mount(estimate, mount, synthesiser.config)
 
-    def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
+    def virtual_sizes(self, image: DepthInput) -> list[tuple[int, int]]:
         """Compute the sizes (rows, columns) at which the generator sees one image.
 
         Raises:

@@ -10,12 +10,12 @@ from depthpose.core.errors import InputError
 from depthpose.core.files.images import check_image
 from depthpose.depth.stereo import Matcher
 from depthpose.depth.triangulation import estimate_from_pair, join_warnings
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, DepthInput
 
 
 @torch.no_grad()
 def depth_from_pair(
-    matcher: Matcher, pair: StereoInput, *, with_check: bool = True
+    matcher: Matcher, pair: DepthInput, *, with_check: bool = True
 ) -> DepthEstimate:
     """Estimate depth of a rectified pair.
 
@@ -38,7 +38,7 @@ def depth_from_pair(
     return replace(estimate, warning=join_warnings(warning, estimate.warning))
 
 
-def check_rectified_pair(pair: StereoInput, *, with_check: bool = True) -> str:
+def check_rectified_pair(pair: DepthInput, *, with_check: bool = True) -> str:
     """Refuse two images that are no rectified pair; return a warning where that is uncertain.
 
     Args:

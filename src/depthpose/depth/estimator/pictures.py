@@ -25,7 +25,7 @@ from depthpose.depth.estimator.net import (
     FakestereoNet,
     as_input,
 )
-from depthpose.depth.types import Map, StereoInput
+from depthpose.depth.types import DepthInput, Map
 
 _PHONE_FOCAL_WIDTHS = 0.75
 """Focal length of a phone's main camera, in widths of the picture."""
@@ -92,7 +92,7 @@ class DepthPipeline:
         """Estimate pictures in batches; without a camera a phone's is assumed, with a notice."""
         remaining = iter(pictures)
         while chunk := list(islice(remaining, batch)):
-            inputs: list[StereoInput] = []
+            inputs: list[DepthInput] = []
             for picture in chunk:
                 depth_input = as_input(_open_picture(picture, timeout), "the picture", lens)
                 if depth_input.camera is None:

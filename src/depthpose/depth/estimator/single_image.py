@@ -19,14 +19,14 @@ from depthpose.depth.disparity import resize_image, resize_match, size_at_focal_
 from depthpose.depth.stereo import Matcher, match_in_usual_range
 from depthpose.depth.synthesis import SynthesisedViews, Synthesiser
 from depthpose.depth.triangulation import estimate_from_virtual, join_warnings
-from depthpose.depth.types import DepthEstimate, Match, StereoInput, Views
+from depthpose.depth.types import DepthEstimate, DepthInput, Match, Views
 
 
 @torch.no_grad()
 def depth_from_images(
     synthesiser: Synthesiser,
     matcher: Matcher | None,
-    images: Sequence[StereoInput],
+    images: Sequence[DepthInput],
     *,
     allow_ood: bool = False,
 ) -> list[DepthEstimate]:
@@ -58,7 +58,7 @@ def depth_from_images(
 def _estimate_one_size(
     synthesiser: Synthesiser,
     matcher: Matcher | None,
-    images: Sequence[StereoInput],
+    images: Sequence[DepthInput],
     sizes: Sequence[tuple[int, int]],
     *,
     allow_ood: bool,
@@ -92,7 +92,7 @@ def _estimate_one_size(
 
 
 def virtual_sizes(
-    synthesiser: Synthesiser, image: StereoInput, *, allow_ood: bool = False
+    synthesiser: Synthesiser, image: DepthInput, *, allow_ood: bool = False
 ) -> list[tuple[int, int]]:
     """Compute the sizes (rows, columns) at which the generator sees one image.
 

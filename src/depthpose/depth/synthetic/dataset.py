@@ -29,7 +29,7 @@ from depthpose.depth.synthetic.visibility import (
     render_light,
     view_from,
 )
-from depthpose.depth.types import Map, Mask, RawFrame, StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import DepthInput, DepthSample, DepthTruth, Map, Mask, RawFrame
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -153,7 +153,7 @@ class Streets:
         """Return the number of frames."""
         return self.config.frames
 
-    def __getitem__(self, index: int) -> StereoSample:
+    def __getitem__(self, index: int) -> DepthSample:
         """Render one sample; its truth is exact, and NaN in the sky.
 
         Raises:
@@ -163,9 +163,9 @@ class Streets:
             raise IndexError(f"frame {index} of {len(self)}")
         frame = render_street(self.config, index)
         name = f"street_{self.config.seed}_{index:06d}"
-        return StereoSample(
-            input=StereoInput(name=name, left=frame.left, right=frame.right, camera=frame.rig),
-            truth=StereoTruth(
+        return DepthSample(
+            input=DepthInput(name=name, left=frame.left, right=frame.right, camera=frame.rig),
+            truth=DepthTruth(
                 disparity_px=frame.disparity_px,
                 depth_m=frame.depth_m,
                 occluded=frame.occluded,
