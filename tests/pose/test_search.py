@@ -268,8 +268,7 @@ def test_turns_that_fit_as_well_are_named() -> None:
     found = register(
         cloud,
         net._find_object("mug").prepare(),
-        net.config,
-        RefusalConfig(min_observability=0.0, min_probability=0.0),
+        EstimateConfig(refusal=RefusalConfig(min_observability=0.0, min_probability=0.0)),
         Stopwatch(),
         proposals=truth[None],
         prior_odds=PRIOR_PROPOSED,
@@ -316,13 +315,11 @@ def test_forty_models_take_bounded_time(net: Registration, monkeypatch: pytest.M
     registered = list[str]()
 
     def count(
-        cloud: CloudInput, prepared: PreparedObject, config: EstimateConfig,
-        refusal: RefusalConfig, watch: Stopwatch, *, proposals: Rigid, prior_odds: float,
+        cloud: CloudInput, prepared: PreparedObject, config: EstimateConfig, watch: Stopwatch,
+        *, proposals: Rigid, prior_odds: float,
     ) -> PoseEstimate:  # fmt: skip
         registered.append(cloud.name)
-        return register(
-            cloud, prepared, config, refusal, watch, proposals=proposals, prior_odds=prior_odds
-        )
+        return register(cloud, prepared, config, watch, proposals=proposals, prior_odds=prior_odds)
 
     monkeypatch.setattr(search, "register", count)
     prepared = net._find_object("bracket").prepare()
@@ -367,7 +364,6 @@ PREPARED = PreparedObject(number=0, model=bracket(), surface=bracket_surface())
 TARGETS = SearchTargets(
     objects={"a": PREPARED, "b": PREPARED, "c": PREPARED},
     config=EstimateConfig(),
-    refusal=RefusalConfig(),
 )
 
 

@@ -23,7 +23,7 @@ from depthpose.core.stopwatch import Stopwatch
 from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, add_background
 from depthpose.pose.color_inputs import add_color
-from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets.detections import Box, Detection, mask_view
 from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.inputs import (
@@ -40,7 +40,7 @@ from depthpose.pose.inputs import (
 from depthpose.pose.pipeline import register
 from depthpose.pose.refusals import answer, unreadable_on_error
 from depthpose.pose.search import SearchTargets, find_objects
-from depthpose.pose.track import TrackedObject, track
+from depthpose.pose.track import track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.verify.decide import choose_object, seconds_of_all
 from depthpose.pose.verify.prepared_object import PreparedObject
@@ -56,7 +56,6 @@ class PoseEstimator:
     Args:
         models: the objects.
         config: ICP, limits, device.
-        refusal: when what is registered, searched or tracked is withheld.
     """
 
     holder: ClassVar = "weights"
@@ -66,12 +65,9 @@ class PoseEstimator:
     expects_all: ClassVar = False
     """Whether every object is expected in every image, as that of a CAD file is."""
 
-    def __init__(
-        self, models: Sequence[ObjectModel], config: EstimateConfig | None, refusal: RefusalConfig
-    ) -> None:
+    def __init__(self, models: Sequence[ObjectModel], config: EstimateConfig | None) -> None:
         self.config = EstimateConfig() if config is None else config
         self.models = tuple(models)
-        self.refusal = refusal
         self.objects = tuple(model.name for model in models)
         """Names of the objects."""
         self._prepared_objects: dict[str, PreparedObject] = {}  # by name, those asked for so far
@@ -136,7 +132,7 @@ class PoseEstimator:
             return self._search_region(pose_input)
         prepared = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
-        work = partial(register, pose_input, prepared, self.config, self.refusal, watch)
+        work = partial(register, pose_input, prepared, self.config, watch)
         estimate = answer(pose_input, watch, work)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
@@ -165,7 +161,6 @@ class PoseEstimator:
         return SearchTargets(
             objects={name: self._find_object(name).prepare() for name in names},
             config=self.config,
-            refusal=self.refusal,
             prior_odds=prior_odds,
             is_single=is_single,
         )
@@ -423,14 +418,8 @@ class PoseEstimator:
                 return self._estimate(pose_input, is_expected=False)
             return find_objects(pose_input, self._targets([object], is_single=True))[0]
 
-        prepared = self._find_object(object)
-        target = TrackedObject(
-            prepared=prepared,
-            refusal=self.refusal,
-            config=self.config,
-            search=search,
-        )
-        return iterate_in_float32(track(frames, target, first))
+        estimates = track(frames, self._find_object(object), self.config, search, first)
+        return iterate_in_float32(estimates)
 
     def surface_of(self, object: str) -> Surface:
         """Return the sampled surface of an object, by which its poses are refined and compared.

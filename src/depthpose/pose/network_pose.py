@@ -26,7 +26,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import ObjectCloud, cloud_from_depth, prepare_cloud, require_points
-from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator import NEEDS_MASK, PoseEstimator
 from depthpose.pose.geometry.grid import VoxelGrid, sample_and_voxelise
 from depthpose.pose.icp import refine_best, rotate_starts
@@ -116,8 +116,10 @@ class GeoPoseNet(PoseEstimator):
     """By which the weights were loaded; empty where they came from memory."""
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        # The weights have their own limits for votes; those of searches are the usual ones.
-        super().__init__(weights.models, config, RefusalConfig())
+        config = EstimateConfig() if config is None else config
+        if config.refusal is None:
+            config = replace(config, refusal=weights.refusal)
+        super().__init__(weights.models, config)
         self.weights = weights
         self.terms = weights.facts.get("terms", "")
         """Terms of the weights that bind whoever uses them; empty without any."""
@@ -337,7 +339,6 @@ class GeoPoseNet(PoseEstimator):
                 refined,
                 others,
                 config,
-                self.weights.refusal,
                 watch,
                 prior_odds=PRIOR_EXPECTED if job.is_expected else PRIOR_PROPOSED,
                 votes_rad=partial(self._measure_disagreement, job),
@@ -394,7 +395,7 @@ class DepthImageRegressor(PoseEstimator):
     needs_mask = True
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        super().__init__(weights.models, config, weights.refusal)
+        super().__init__(weights.models, config)
         if not isinstance(weights.network, DepthImageNet):
             raise InputError(
                 "these weights cast votes and regress no depth image; load them as GeoPoseNet"

@@ -14,7 +14,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import ObjectCloud, prepare_cloud
-from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
+from depthpose.pose.config import CloudConfig, EstimateConfig
 from depthpose.pose.geometry.grid import fit_local_planes, thin_cloud
 from depthpose.pose.icp import refine_best
 from depthpose.pose.propose.point_pairs import propose_poses
@@ -35,7 +35,6 @@ def register(
     pose_input: AnyInput,
     prepared: PreparedObject,
     config: EstimateConfig,
-    refusal: RefusalConfig,
     watch: Stopwatch,
     *,
     proposals: Rigid | None = None,
@@ -46,8 +45,7 @@ def register(
     Args:
         pose_input: the points.
         prepared: the object.
-        config: of ICP, and of what a real object is off from its model.
-        refusal: when the estimate is withheld.
+        config: of ICP and limits.
         watch: to which the times of the stages are added.
         proposals: poses of a search; None: point pairs of the points propose.
         prior_odds: of the best pose being right, before its evidence is seen.
@@ -76,7 +74,7 @@ def register(
         )
 
     # Compare, compete, decide.
-    return judge(cloud, prepared, refined, others, config, refusal, watch, prior_odds=prior_odds)
+    return judge(cloud, prepared, refined, others, config, watch, prior_odds=prior_odds)
 
 
 def propose_by_pairs(cloud: ObjectCloud, prepared: PreparedObject, seed: int) -> Rigid:
@@ -95,7 +93,6 @@ def judge(
     refined: PoseFit,
     others: Rigid,
     config: EstimateConfig,
-    refusal: RefusalConfig,
     watch: Stopwatch,
     *,
     prior_odds: float,
@@ -108,8 +105,7 @@ def judge(
         prepared: the object.
         refined: the best pose.
         others: at which refinement ended too, or that were proposed.
-        config: settings of the estimate; without ICP competing poses stay where they are.
-        refusal: when it is withheld.
+        config: of limits, and of ICP, without which competing poses stay where they are.
         watch: of the stages before, to which this one's are added.
         prior_odds: of the best pose being right, before its evidence is seen.
         votes_rad: angle between a network's directions and a pose, as :func:`compete` takes it.
@@ -140,7 +136,6 @@ def judge(
             prepared,
             competition,
             observation,
-            refusal=refusal,
             config=config,
             prior_odds=prior_odds,
         )

@@ -22,7 +22,7 @@ from depthpose.core.devices import map_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import cloud_from_depth, require_same_size, why_nothing_seen
-from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.footprint import crop_to_region, explained_frame_mask, why_background_excludes
 from depthpose.pose.frame import Frame, prepare_frame
 from depthpose.pose.icp import refine_roughly
@@ -70,8 +70,7 @@ class SearchTargets:
     """What is looked for."""
 
     objects: Mapping[str, PreparedObject]  #: by their names
-    config: EstimateConfig  #: of ICP, and of what a real object is off from its model
-    refusal: RefusalConfig  #: when a pose is withheld
+    config: EstimateConfig  #: of ICP and limits
     prior_odds: float = PRIOR_PROPOSED  #: of the best pose at a place being right
     #: at most one instance of each object is expected, as in a detector's box or a frame of a
     #: track. Then (1) one round searches the image, (2) a place is left out that lies mostly beside
@@ -321,7 +320,6 @@ def _judge(
             cloud,
             targets.objects[leader.object],
             targets.config,
-            targets.refusal,
             watch,
             proposals=Rigid.stack([place.pose for place in group]),
             prior_odds=targets.prior_odds,
@@ -385,7 +383,7 @@ def _weigh_instances(
         for place, share in zip(places, shares.tolist(), strict=True):
             estimate = with_share(place.estimate, share)
             assert estimate.certainty is not None, "judged poses have evidence"
-            if estimate.certainty >= targets.refusal.min_probability:
+            if estimate.certainty >= targets.config.limits.min_probability:
                 remaining.append(replace(place, estimate=estimate))
             else:
                 reason = (

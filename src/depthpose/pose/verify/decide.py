@@ -44,7 +44,6 @@ def decide(
     competition: Competition,
     observation: Observation,
     *,
-    refusal: RefusalConfig,
     config: EstimateConfig,
     prior_odds: float,
 ) -> PoseEstimate:
@@ -55,8 +54,7 @@ def decide(
         prepared: the object.
         competition: of its poses.
         observation: that they were compared with.
-        refusal: limits.
-        config: settings of the estimate; without ICP size and mirror image are not tested.
+        config: of limits; without ICP size and mirror image are not tested.
         prior_odds: of the best pose being right, before its evidence is seen.
 
     Raises:
@@ -76,9 +74,9 @@ def decide(
         "evidence": best.evidence,
     }
     try:
-        require_observable(cloud.cloud_m, prepared, best.pose, free, refusal.min_observability)
-        require_right(best.evidence, probability, refusal, is_masked=observation.is_masked)
-        identity = _require_identity(cloud, prepared, best, observation, config, refusal)
+        require_observable(cloud.cloud_m, prepared, best.pose, free, config.limits)
+        require_right(best.evidence, probability, config.limits, is_masked=observation.is_masked)
+        identity = _require_identity(cloud, prepared, best, observation, config)
     except Refused as refused:  # all but the pose, so that nobody takes it for an estimate
         reason = refused.reason + (hint if refused.status == "doubtful" else "")
         measured = {**measured, **refused.measured}
@@ -108,7 +106,7 @@ def require_observable(
     prepared: PreparedObject,
     pose: Rigid,
     free: Float[Tensor, "k 6"],
-    least: float,
+    limits: RefusalConfig,
 ) -> None:
     """Raise :class:`Refused` where a view leaves a motion beside the free ones undetermined.
 
@@ -121,7 +119,7 @@ def require_observable(
         pose: of it.
         free: motions of declared symmetries, by
             :func:`~depthpose.pose.verify.observability.free_motions`.
-        least: share of its length by which every other motion must move the visible surface.
+        limits: the least share by which every other motion must move the visible surface.
     """
     near_axis = prepared.copies.near_axis
     if near_axis is not None:
@@ -130,7 +128,7 @@ def require_observable(
     if observed is None:
         raise Refused("doubtful", "too few points lie on the posed surface to determine a pose")
     observable, weakest = observed
-    if observable >= least:
+    if observable >= limits.min_observability:
         return
     motion = "rotation" if float(weakest[:3].norm()) > math.sqrt(0.5) else "shift"
     raise Refused(
@@ -142,17 +140,17 @@ def require_observable(
 
 
 def require_right(
-    evidence: Evidence, probability: float, refusal: RefusalConfig, *, is_masked: bool
+    evidence: Evidence, probability: float, limits: RefusalConfig, *, is_masked: bool
 ) -> None:
     """Raise :class:`Refused` where a pose is right with too small a probability.
 
     Args:
         evidence: of the pose.
         probability: of its being right.
-        refusal: the least probability.
+        limits: the least probability.
         is_masked: whether all points were taken for the object's, as a mask gives them.
     """
-    if probability < refusal.min_probability:
+    if probability < limits.min_probability:
         raise Refused("doubtful", explain_doubt(evidence, probability, is_masked=is_masked))
 
 
@@ -162,14 +160,14 @@ def _require_identity(
     best: Hypothesis,
     observation: Observation,
     config: EstimateConfig,
-    refusal: RefusalConfig,
 ) -> Identity | None:
     """Raise :class:`Refused` where another size or the mirror image of the object fits better.
 
     Returns:
         Whether it is this object; None where that is not tested.
     """
-    if not config.with_icp or refusal.max_size_error >= 1:
+    max_size_error = config.limits.max_size_error
+    if not config.with_icp or max_size_error >= 1:
         return None
     identity = identify(
         cloud.cloud_m,
@@ -179,7 +177,7 @@ def _require_identity(
         prepared.copies.mirror,
         best.evidence,
         observation.focal_px,
-        refusal.max_size_error,
+        max_size_error,
     )
     if identity.status == "contradicted":
         raise Refused("doubtful", identity.reason, identity=identity)
