@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -39,7 +40,6 @@ from depthpose.pose.types import CloudInput, Evidence, ObjectModel, PoseEstimate
 from depthpose.pose.verify.copies import find_copies
 from depthpose.pose.verify.evidence import compare, observe
 from depthpose.pose.verify.prepared_object import PreparedObject
-from depthpose.pose.verify.probability import PRIOR_PROPOSED
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 
@@ -271,7 +271,7 @@ def test_turns_that_fit_as_well_are_named() -> None:
         EstimateConfig(refusal=RefusalConfig(min_observability=0.0, min_probability=0.0)),
         Stopwatch(),
         proposals=truth[None],
-        prior_odds=PRIOR_PROPOSED,
+        is_expected=False,
     )
     assert found.camera_from_model is not None
     named = [found.camera_from_model, *(one.camera_from_model for one in found.alternatives)]
@@ -316,10 +316,10 @@ def test_forty_models_take_bounded_time(net: Registration, monkeypatch: pytest.M
 
     def count(
         cloud: CloudInput, prepared: PreparedObject, config: EstimateConfig, watch: Stopwatch,
-        *, proposals: Rigid, prior_odds: float,
+        **options: Any,  # noqa: ANN401
     ) -> PoseEstimate:  # fmt: skip
         registered.append(cloud.name)
-        return register(cloud, prepared, config, watch, proposals=proposals, prior_odds=prior_odds)
+        return register(cloud, prepared, config, watch, **options)
 
     monkeypatch.setattr(search, "register", count)
     prepared = net._find_object("bracket").prepare()
@@ -437,7 +437,7 @@ def test_a_box_holds_one() -> None:
     places = of_one_object(math.log(20), math.log(20))
     remaining, _ = search._weigh_instances(places, TARGETS)
     assert len(remaining) == 2
-    remaining, misses = search._weigh_instances(places, replace(TARGETS, is_single=True))
+    remaining, misses = search._weigh_instances(places, replace(TARGETS, instances="one at most"))
     assert not remaining
     assert "49%" in misses[0].reason, "20 of 41"
 
@@ -547,7 +547,7 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
     assert [estimate.object for estimate in found] == ["a", "a", "a", "b"], "the surest first"
     assert [estimate.name for estimate in found] == ["x_0", "x_1", "x_2", "x_3"]
     searched.clear()
-    single = find_objects(view, replace(targets, is_single=True))
+    single = find_objects(view, replace(targets, instances="one at most"))
     assert [estimate.object for estimate in single] == ["a", "b"], "searched once, one of each"
 
 

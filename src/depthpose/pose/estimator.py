@@ -39,12 +39,11 @@ from depthpose.pose.inputs import (
 )
 from depthpose.pose.pipeline import register
 from depthpose.pose.refusals import answer, unreadable_on_error
-from depthpose.pose.search import SearchTargets, find_objects
+from depthpose.pose.search import Instances, SearchTargets, find_objects
 from depthpose.pose.track import track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.verify.decide import choose_object, seconds_of_all
 from depthpose.pose.verify.prepared_object import PreparedObject
-from depthpose.pose.verify.probability import PRIOR_EXPECTED, PRIOR_PROPOSED
 
 NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 _NAME = "input"  # what an input is called that came without a name
@@ -144,14 +143,12 @@ class PoseEstimator:
 
     def _search_region(self, view: ViewInput) -> PoseEstimate:
         """Search the one object that is somewhere in the mask of a view, as in a box."""
-        targets = self._targets([view.object], prior_odds=PRIOR_EXPECTED, is_single=True)
+        targets = self._targets([view.object], "one")
         best = find_objects(view, targets)[0]
         return replace(best, name=view.name)
 
-    def _targets(
-        self, names: Sequence[str], *, prior_odds: float = PRIOR_PROPOSED, is_single: bool = False
-    ) -> SearchTargets:
-        """Prepare objects for a search; arguments as in :class:`SearchTargets`.
+    def _targets(self, names: Sequence[str], instances: Instances = "any number") -> SearchTargets:
+        """Prepare objects for a search, of which there are so many ``instances``.
 
         Raises:
             InputError: an unknown object, or this estimator cannot search.
@@ -161,8 +158,7 @@ class PoseEstimator:
         return SearchTargets(
             objects={name: self._find_object(name).prepare() for name in names},
             config=self.config,
-            prior_odds=prior_odds,
-            is_single=is_single,
+            instances=instances,
         )
 
     @torch.no_grad()
@@ -416,7 +412,7 @@ class PoseEstimator:
             """Pose the object in a frame without a pose of the frame before."""
             if isinstance(pose_input, CloudInput):
                 return self._estimate(pose_input, is_expected=False)
-            return find_objects(pose_input, self._targets([object], is_single=True))[0]
+            return find_objects(pose_input, self._targets([object], "one at most"))[0]
 
         estimates = track(frames, self._find_object(object), self.config, search, first)
         return iterate_in_float32(estimates)

@@ -44,7 +44,6 @@ from depthpose.pose.types import (
 )
 from depthpose.pose.verify.observability import free_motions, without_motions
 from depthpose.pose.verify.prepared_object import PreparedObject, has_surface, require_surface
-from depthpose.pose.verify.probability import PRIOR_EXPECTED, PRIOR_PROPOSED
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
@@ -340,7 +339,7 @@ class GeoPoseNet(PoseEstimator):
                 others,
                 config,
                 watch,
-                prior_odds=PRIOR_EXPECTED if job.is_expected else PRIOR_PROPOSED,
+                is_expected=job.is_expected,
                 votes_rad=partial(self._measure_disagreement, job),
             )
         except Refused as refused:

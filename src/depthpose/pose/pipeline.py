@@ -24,7 +24,6 @@ from depthpose.pose.verify.decide import decide
 from depthpose.pose.verify.evidence import observe
 from depthpose.pose.verify.hypotheses import compete
 from depthpose.pose.verify.prepared_object import PreparedObject
-from depthpose.pose.verify.probability import PRIOR_EXPECTED
 
 _VOTING_DIAMETERS = 0.05  # distance of the points that vote
 _PROPOSALS = 40  # poses that point pairs propose
@@ -38,7 +37,7 @@ def register(
     watch: Stopwatch,
     *,
     proposals: Rigid | None = None,
-    prior_odds: float = PRIOR_EXPECTED,
+    is_expected: bool = True,
 ) -> PoseEstimate:
     """Register a model to the points of an object: of a mask, or where a search proposed it.
 
@@ -48,7 +47,7 @@ def register(
         config: of ICP and limits.
         watch: to which the times of the stages are added.
         proposals: poses of a search; None: point pairs of the points propose.
-        prior_odds: of the best pose being right, before its evidence is seen.
+        is_expected: whether a mask or a detector's box says that the object is there.
 
     Raises:
         InputError: mask and depth differ in size.
@@ -74,7 +73,7 @@ def register(
         )
 
     # Compare, compete, decide.
-    return judge(cloud, prepared, refined, others, config, watch, prior_odds=prior_odds)
+    return judge(cloud, prepared, refined, others, config, watch, is_expected=is_expected)
 
 
 def propose_by_pairs(cloud: ObjectCloud, prepared: PreparedObject, seed: int) -> Rigid:
@@ -95,7 +94,7 @@ def judge(
     config: EstimateConfig,
     watch: Stopwatch,
     *,
-    prior_odds: float,
+    is_expected: bool,
     votes_rad: Callable[[Rigid], float] | None = None,
 ) -> PoseEstimate:
     """Compare a refined pose with the depth image and with its competitors, and decide.
@@ -107,7 +106,7 @@ def judge(
         others: at which refinement ended too, or that were proposed.
         config: of limits, and of ICP, without which competing poses stay where they are.
         watch: of the stages before, to which this one's are added.
-        prior_odds: of the best pose being right, before its evidence is seen.
+        is_expected: whether a mask or a detector's box says that the object is there.
         votes_rad: angle between a network's directions and a pose, as :func:`compete` takes it.
 
     Raises:
@@ -137,6 +136,6 @@ def judge(
             competition,
             observation,
             config=config,
-            prior_odds=prior_odds,
+            is_expected=is_expected,
         )
     return replace(estimate, seconds=watch.seconds)

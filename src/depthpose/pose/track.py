@@ -324,7 +324,7 @@ def _weigh_pose(
         is_masked=False,
     )
     evidence = compare(observation, pose, surface)
-    probability = probability_right(evidence, PRIOR_EXPECTED)
+    probability = probability_right(evidence, is_expected=True)
     require_right(evidence, probability, limits, is_masked=False)
 
     # Together with the frames before.

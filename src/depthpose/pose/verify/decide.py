@@ -45,7 +45,7 @@ def decide(
     observation: Observation,
     *,
     config: EstimateConfig,
-    prior_odds: float,
+    is_expected: bool,
 ) -> PoseEstimate:
     """Return the likeliest of competing poses as the estimate.
 
@@ -55,14 +55,14 @@ def decide(
         competition: of its poses.
         observation: that they were compared with.
         config: of limits; without ICP size and mirror image are not tested.
-        prior_odds: of the best pose being right, before its evidence is seen.
+        is_expected: whether a mask or a detector's box says that the object is there.
 
     Raises:
         Refused: it is not observable, doubtful, or of another object.
     """
     model = prepared.model
     best = competition.best
-    probability = probability_right(best.evidence, prior_odds)
+    probability = probability_right(best.evidence, is_expected=is_expected)
     free = free_motions(model.symmetries.continuous, best.pose)
 
     # A cloud, other than a depth image, may be in another frame than the camera's.
