@@ -70,7 +70,6 @@ def _content(value: object) -> object:
 def prepared_once() -> Iterator[None]:
     """What an estimator computes of a shape, and Git's answer, is computed once a process."""
     from depthpose.core import environment
-    from depthpose.pose import estimator
     from depthpose.pose.verify import prepared_object
 
     made: dict[object, Any] = {}
@@ -85,8 +84,8 @@ def prepared_once() -> Iterator[None]:
         return give
 
     with pytest.MonkeyPatch.context() as patch:
-        surface = once(estimator.prepare_surface, lambda *given: _content(given))
-        patch.setattr(estimator, "prepare_surface", surface)
+        surface = once(prepared_object.prepare_surface, lambda *given: _content(given))
+        patch.setattr(prepared_object, "prepare_surface", surface)
         patch.setattr(prepared_object, "prepare_pairs", once(prepared_object.prepare_pairs, id))
         patch.setattr(environment, "_read_commit", cache(environment._read_commit))
         yield

@@ -27,7 +27,6 @@ from tests.pose.synthetic_objects import (
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.icp import refine_exactly
 from depthpose.pose.mesh import (
     NearSymmetry,
@@ -142,7 +141,7 @@ def test_copies_of_a_plate_stay_where_its_symmetry_has_them(seed: int) -> None:
     depth_m = depth_m + 0.0012 * torch.randn(depth_m.shape, generator=noise)
     view = ViewInput(name="a", depth_m=depth_m.float(), mask=mask, K=K, object=plate.name)
     cloud_m = cloud_from_depth(view.depth_m, mask, K).double()
-    prepared = PreparedObject(number=0, model=plate, surface=prepare_surface(plate))
+    prepared = PreparedObject(number=0, model=plate)
 
     leading = truth @ half_turn([1.0, 0.0, 0.0])
     refined = refine_exactly(cloud_m, leading, prepared.surface, start_diameters=0.05)
@@ -169,7 +168,7 @@ def turned_about_near_axis(prepared: PreparedObject, pose: Rigid, degrees: float
 def test_a_copy_that_drifts_competes_where_it_began_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """One drifts onto the winner and one to another angle: each start stays, and the new angle."""
     mug = make_part("mug", 1)
-    prepared = PreparedObject(number=0, model=mug, surface=prepare_surface(mug))
+    prepared = PreparedObject(number=0, model=mug)
     truth = pose_at(seed=1).double()
     turned = partial(turned_about_near_axis, prepared, truth)
     competitors = [
@@ -192,7 +191,7 @@ def test_a_pose_that_is_one_of_the_copies_competes_with_none(
 ) -> None:
     """Between two copies about an axis lies no other pose: the group has its probability."""
     mug = make_part("mug", 1)
-    prepared = PreparedObject(number=0, model=mug, surface=prepare_surface(mug))
+    prepared = PreparedObject(number=0, model=mug)
     truth = pose_at(seed=1).double()
     turned = partial(turned_about_near_axis, prepared, truth)
 
@@ -230,7 +229,7 @@ def test_only_what_has_a_copy_is_less_certain_of_it() -> None:
 def test_a_copy_that_drifted_about_an_axis_is_put_back_to_its_angle_alone() -> None:
     """What refinement changed besides, here a shift, stays."""
     mug = make_part("mug", 1)
-    prepared = PreparedObject(number=0, model=mug, surface=prepare_surface(mug))
+    prepared = PreparedObject(number=0, model=mug)
     shift = Rigid(torch.eye(3).double(), torch.tensor([0.0, 0.0, 0.004]).double())
     turned = partial(turned_about_near_axis, prepared, pose_at(seed=1).double())
     start, drifted = turned(30.0), turned(70.0)

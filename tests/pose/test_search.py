@@ -326,8 +326,8 @@ def test_forty_models_take_bounded_time(net: Registration, monkeypatch: pytest.M
     objects: dict[str, PreparedObject] = {}
     for k in range(40):
         model = replace(prepared.model, name=f"part {k}")
-        copy = PreparedObject(number=k, model=model, surface=prepared.surface)
-        copy.copies, copy.pairs = prepared.copies, prepared.pairs  # computed once
+        copy = PreparedObject(number=k, model=model)
+        copy.surface, copy.copies, copy.pairs = prepared.surface, prepared.copies, prepared.pairs
         objects[model.name] = copy
     targets = replace(TARGETS, objects=objects)
     began = time.process_time()
@@ -360,7 +360,7 @@ def judged(
     )
 
 
-PREPARED = PreparedObject(number=0, model=bracket(), surface=bracket_surface())
+PREPARED = PreparedObject(number=0, model=bracket())
 TARGETS = SearchTargets(
     objects={"a": PREPARED, "b": PREPARED, "c": PREPARED},
     config=EstimateConfig(),

@@ -23,7 +23,6 @@ from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose import track as track_module
 from depthpose.pose.background import add_background
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
 from depthpose.pose.refusals import Refused
@@ -108,7 +107,7 @@ def test_it_is_lost_where_it_is_taken_away_or_covered_and_found_when_back() -> N
 
 def test_a_track_that_its_history_ends_does_not_blame_the_frame() -> None:
     pose = pose_at(z_m=0.7, seed=3)
-    prepared = PreparedObject(number=0, model=bracket(), surface=bracket_surface())
+    prepared = PreparedObject(number=0, model=bracket())
     doubted = track_module._Track(pose=pose.double(), motion=None, log_odds=-9.0, first=None)
     depth_m = frame(pose)
     everywhere = torch.ones_like(depth_m, dtype=torch.bool)
@@ -116,6 +115,13 @@ def test_a_track_that_its_history_ends_does_not_blame_the_frame() -> None:
     said = "together with the frames before it the pose is right with a .* alone with 100%$"
     with pytest.raises(Refused, match=said):
         track_module._follow(view, doubted, prepared, EstimateConfig())
+
+
+def test_what_is_computed_of_the_model_is_not_in_the_time_of_the_first_frame() -> None:
+    poses = moving(1)
+    net = oracle(poses)
+    net.track([frame(poses[0])], CAMERA, first=poses[0])
+    assert "copies" in vars(net._find_object("bracket")), "before any frame is taken"
 
 
 def test_a_part_that_is_hidden_does_not_lose_it() -> None:
@@ -213,7 +219,7 @@ def test_what_else_it_may_be_moves_along() -> None:
     )  # fmt: skip
     net = oracle(poses)
     model = net.weights.models[0]
-    prepared = PreparedObject(number=0, model=model, surface=prepare_surface(model))
+    prepared = PreparedObject(number=0, model=model)
     views = [back_project(frame(p).double(), K).reshape(-1, 3) for p in poses]
     from depthpose.pose.types import CloudInput
 

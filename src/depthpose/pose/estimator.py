@@ -25,7 +25,7 @@ from depthpose.pose.background import AnyBackground, add_background
 from depthpose.pose.color_inputs import add_color
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets.detections import Box, Detection, mask_view
-from depthpose.pose.geometry.surface import Surface, prepare_surface
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.inputs import (
     AnyArray,
     AnyCloud,
@@ -69,7 +69,15 @@ class PoseEstimator:
         self.models = tuple(models)
         self.objects = tuple(model.name for model in models)
         """Names of the objects."""
-        self._prepared_objects: dict[str, PreparedObject] = {}  # by name, those asked for so far
+        self._known = {
+            model.name: PreparedObject(
+                number=number,
+                model=model,
+                surface_points=self.config.icp.surface_points,
+                deviation_m=self.config.object_deviation_m,
+            )
+            for number, model in enumerate(models)
+        }
 
     @torch.no_grad()
     @force_float32()
@@ -414,7 +422,8 @@ class PoseEstimator:
                 return self._estimate(pose_input, is_expected=False)
             return find_objects(pose_input, self._targets([object], "one at most"))[0]
 
-        estimates = track(frames, self._find_object(object), self.config, search, first)
+        prepared = self._find_object(object).prepare()
+        estimates = track(frames, prepared, self.config, search, first)
         return iterate_in_float32(estimates)
 
     def surface_of(self, object: str) -> Surface:
@@ -426,7 +435,7 @@ class PoseEstimator:
         return self._find_object(object).surface
 
     def _find_object(self, name: str | None) -> PreparedObject:
-        """Find an object by its name, with its surface; None where one alone is known.
+        """Find an object by its name; None where one alone is known.
 
         Raises:
             InputError: no object has this name, or several are known and none is named.
@@ -441,21 +450,10 @@ class PoseEstimator:
         if not isinstance(name, str):
             listing = ", ".join(map(repr, names))
             raise InputError(f"object {name!r} is no text; give the name of one: {listing}")
-        if name not in names:
+        if name not in self._known:
             nearest = suggest_name(name, names)
             raise InputError(f"object {name!r}: the {self.holder} do not know it; {nearest}")
-
-        # Its surface is sampled when it is first asked for.
-        if name not in self._prepared_objects:
-            number = names.index(name)
-            model = self.models[number]
-            surface = prepare_surface(
-                model, self.config.icp.surface_points, self.config.object_deviation_m
-            )
-            self._prepared_objects[name] = PreparedObject(
-                number=number, model=model, surface=surface
-            )
-        return self._prepared_objects[name]
+        return self._known[name]
 
 
 def _require_input(pose_input: AnyInput) -> AnyInput:

@@ -215,14 +215,11 @@ class GeoPoseNet(PoseEstimator):
     ) -> CloudToPose | PoseEstimate:
         """Lift an input to the cloud and the voxels that the network takes.
 
-        For a region, or an input that is refused, the finished estimate is returned instead. The
-        point pairs of a model take half a second: a mere try of many objects does without.
+        For a region, or an input that is refused, the finished estimate is returned instead.
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        prepared = self._find_object(pose_input.object)
-        # Now, so that the time of no stage includes it.
-        _ = prepared.prepare() if is_expected else prepared.copies
+        prepared = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
 
         def lift() -> CloudToPose:
@@ -418,6 +415,7 @@ class DepthImageRegressor(PoseEstimator):
         if not is_expected:
             names = ", ".join(self.objects)
             raise InputError(f"object: say which of {names}; a regressor refuses none")
+        _ = prepared.surface  # computed before any stage is timed
         watch = Stopwatch()
         work = partial(self._regress, pose_input, prepared, watch)
         return answer(pose_input, watch, work)
