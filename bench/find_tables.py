@@ -156,7 +156,8 @@ def main() -> None:
             names = sorted(model.name for model in frame.models)
             began_s = time.perf_counter()
             began_cpu_s = time.process_time()
-            estimates = estimator.find(frame.depth_m, camera, names)
+            answers = estimator.find(frame.depth_m, camera, names)
+            estimates = [estimate for estimate in answers if estimate.is_posed]
             wall_s = time.perf_counter() - began_s
             cpu_s = time.process_time() - began_cpu_s
             rows.append({**count_answers(frame, estimates), "s": wall_s, "cpu s": cpu_s})

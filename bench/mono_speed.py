@@ -122,7 +122,7 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
 
     assert net.synthesiser is not None
     assert image.camera is not None
-    draw = net.synthesiser.draw
+    draw = net.synthesiser.synthesise
     size = size_at_focal_length(image.camera, net.synthesiser.config.virtual_focal_px)
     left = resize_image(image.left, *size)
     right = draw(left[None]).right[0]

@@ -77,7 +77,7 @@ def pose_case(home: Path, case: Case) -> list[Row]:
     def search() -> list[PoseEstimate]:
         if case.with_mask:
             return [registration.estimate(depth=depth, mask=mask, camera=camera)]
-        return registration.find(depth, camera)
+        return [found for found in registration.find(depth, camera) if found.is_posed]
 
     estimates, cpu_s = with_cpu_seconds(search)
     if not estimates:  # though the part is in full view

@@ -53,7 +53,8 @@ def search_bin(home: Path, name: str) -> list[Row]:
     depth = scene / "depth.png"
     camera = scene / "camera.json"
     registration, model = part_of(scene.parent)
-    estimates, cpu_s = with_cpu_seconds(lambda: registration.find(depth, camera))
+    answers, cpu_s = with_cpu_seconds(lambda: registration.find(depth, camera))
+    estimates = [estimate for estimate in answers if estimate.is_posed]
 
     instances = cast(Any, read_json(scene / "truth.json"))["0"]
     truths = [bop_pose(instance) for instance in instances]
@@ -170,7 +171,8 @@ def search_frames(samples: Path, names: tuple[str, ...]) -> list[Row]:
 
 def search_frame(frame: Frame, registration: Registration) -> Row:
     """Search one frame, and count right answers."""
-    estimates, cpu_s = with_cpu_seconds(lambda: registration.find(frame.depth_m, frame.K))
+    answers, cpu_s = with_cpu_seconds(lambda: registration.find(frame.depth_m, frame.K))
+    estimates = [estimate for estimate in answers if estimate.is_posed]
     counts = count_answers(frame, estimates)
     ok = [estimate for estimate in estimates if estimate.is_ok]
     return {

@@ -86,7 +86,8 @@ def of_bins(home: Path, compared: list[Compared]) -> Iterator[Residuals]:
     for scene in bins_of(home, "elbows")[::2][:BINS]:
         registration: Registration = part_of(scene.parent)[0]
         compared.clear()
-        estimates = registration.find(scene / "depth.png", scene / "camera.json")
+        answers = registration.find(scene / "depth.png", scene / "camera.json")
+        estimates = [estimate for estimate in answers if estimate.is_posed]
         yield from of_estimates(estimates, compared)
 
 

@@ -246,7 +246,7 @@ def track(net: GeoPoseNet, model: ObjectModel, frames: Sequence[Frame]) -> Row:
     states = list[str | None]()
     seconds = list[float]()
     errors_percent = list[float]()
-    estimates = net.track_in([frame.view for frame in frames], model.name)
+    estimates = net.track([frame.view for frame in frames], object=model.name)
     for frame in frames:
         estimate, cpu_s = with_cpu_seconds(lambda: next(estimates))
         answer, error = verdict(model, points_m, frame, estimate)
@@ -287,7 +287,7 @@ def search_each(net: GeoPoseNet, model: ObjectModel, frames: Sequence[Frame]) ->
     """Search every frame without earlier frames, and count verdicts."""
     points_m = sample_surface(model, SURFACE_POINTS)[0]
     estimates, cpu_s = with_cpu_seconds(
-        lambda: [net.find_in(frame.view, [model.name])[0] for frame in frames]
+        lambda: [net.find(frame.view, objects=model.name)[0] for frame in frames]
     )
     verdicts = [
         verdict(model, points_m, frame, estimate)[0]

@@ -59,8 +59,8 @@ def step_rates(pairs: PairsConfig) -> dict[str, float]:
     stereo = read_config(CONFIGS / "compact-stereo.yaml", StereoTraining)
     finetune = read_config(CONFIGS / "compact-finetune.yaml", FinetuneTraining)
     generator = UNetGenerator(view.generator)
-    matcher = PSMNet(stereo.matcher)
-    frozen = PSMNet(stereo.matcher)
+    matcher = PSMNet(stereo.network_config)
+    frozen = PSMNet(stereo.network_config)
     stages = {
         "view": (ViewTask(generator, view, None), view),
         "stereo": (StereoTask(matcher, stereo, None), stereo),

@@ -65,7 +65,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[ViewInput]:
         ]
 
     monkeypatch.setattr(Registration, "estimate_many", refuse)
-    monkeypatch.setattr(Registration, "find_in", lambda self, view, _: refuse(self, [view])[:0])
+    monkeypatch.setattr(Registration, "find", lambda self, view, **_: refuse(self, [view])[:0])
     return given
 
 

@@ -198,7 +198,7 @@ def test_a_data_set_is_searched_without_masks(
     truths = {(i.image_id, i.object_id): i.camera_from_model for i in synthetic.instances}
     searched: list[str] = []
 
-    def find_in(_: GeoPoseNet, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+    def find(_: GeoPoseNet, view: ViewInput, *, objects: Sequence[str]) -> list[PoseEstimate]:
         searched.append(view.name)
         assert sorted(objects) == ["bottle", "bracket"]
         assert bool(view.mask.all())
@@ -208,7 +208,7 @@ def test_a_data_set_is_searched_without_masks(
         )
         return [found, replace(nothing_found(view, "bottle", [], 0.0), name=f"{view.name}_1")]
 
-    monkeypatch.setattr(GeoPoseNet, "find_in", find_in)
+    monkeypatch.setattr(GeoPoseNet, "find", find)
     words = ["pose", "predict", "--bop", str(synthetic.folder), "--weights", str(weights)]
     words += ["--masks", "search", "--out", str(tmp_path / "out")]
     assert main(words) == 0
@@ -237,14 +237,14 @@ def test_an_unreadable_image_of_a_searched_dataset_stops_no_other(
     """Each object has a row that says so; once the image is mended it is searched."""
     searched: list[str] = []
 
-    def find_in(_: GeoPoseNet, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+    def find(_: GeoPoseNet, view: ViewInput, *, objects: Sequence[str]) -> list[PoseEstimate]:
         searched.append(view.name)
         return [
             replace(nothing_found(view, name, [], 0.0), name=f"{view.name}_{k}")
             for k, name in enumerate(objects)
         ]
 
-    monkeypatch.setattr(GeoPoseNet, "find_in", find_in)
+    monkeypatch.setattr(GeoPoseNet, "find", find)
     folder = tmp_path / "dataset"
     shutil.copytree(synthetic.folder, folder)
     instance = next(i for i in synthetic.instances if i.image_id == 0)

@@ -265,7 +265,7 @@ def test_a_focal_length_is_enough_of_a_camera(
     if not with_mask:
         words = [words[0], f"{words[1]}/seen.png", *words[4:]]
         # A search takes seconds: what it is given is looked at.
-        monkeypatch.setattr(Oracle, "find_in", lambda _, view, __: searched.append(view) or [])
+        monkeypatch.setattr(Oracle, "find", lambda _, view, **__: searched.append(view) or [])
     at = words.index("--camera")
     bare = [*words[:at], "--focal-px", "500", "--unit", "mm", *words[at + 2 :]]
     given = ["pose", "predict", "--weights", str(weights), "--out"]

@@ -319,7 +319,7 @@ def test_every_object_that_is_looked_for_has_a_row(
     """The bracket is found, the bottle is not: tables, poses.json and page say both."""
     words, _ = scene
 
-    def find_in(_: Oracle, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+    def find(_: Oracle, view: ViewInput, *, objects: Sequence[str]) -> list[PoseEstimate]:
         rows = [nothing_found(view, name, [], 0.0) for name in objects]
         if bool(view.depth_m.isfinite().any()):
             rows[0] = PoseEstimate(
@@ -327,7 +327,7 @@ def test_every_object_that_is_looked_for_has_a_row(
             )
         return [replace(row, name=f"{view.name}_{k}") for k, row in enumerate(rows)]
 
-    monkeypatch.setattr(Oracle, "find_in", find_in)
+    monkeypatch.setattr(Oracle, "find", find)
     write_depth_png(tmp_path / "depth" / "dark.png", torch.full((240, 320), torch.nan), 0.001)
     words[-1] = str(tmp_path / "depth")
     assert main(words) == 0
@@ -346,6 +346,6 @@ def test_every_object_that_is_looked_for_has_a_row(
     page = read_page(tmp_path / "out/report.html")
     assert any(reason in cell for cell in page.texts["td"])
     # A rerun looks for nothing again.
-    monkeypatch.setattr(Oracle, "find_in", lambda *_: pytest.fail("it was searched again"))
+    monkeypatch.setattr(Oracle, "find", lambda *_, **__: pytest.fail("it was searched again"))
     assert main(words) == 0
     assert answers(tmp_path) == rows

@@ -102,7 +102,7 @@ def test_the_thesis_settings_are_the_defaults(name: str) -> None:
     kind = STAGES[name][0]
     found = config_to_dict(read_config(FOLDER / f"{name}.yaml", kind))
     default = config_to_dict(kind())
-    for part in ("pairs", "matcher"):
+    for part in ("pairs", "network"):
         if isinstance(found.get(part), dict):
             del found[part], default[part]
     del found["loop"]["workers"], default["loop"]["workers"]
@@ -136,7 +136,7 @@ def test_the_full_widths_take_a_step() -> None:
     network = UNetGenerator(view.generator)
     for task in (
         ViewTask(network, view, None),
-        FinetuneTask(network, PSMNet(stereo.matcher), tune, None),
+        FinetuneTask(network, PSMNet(stereo.network_config), tune, None),
     ):
         for turn in task.step(pair(256, 512)):
             assert bool(turn.loss.isfinite())
@@ -148,8 +148,8 @@ def test_the_full_widths_take_a_step() -> None:
 def test_the_compact_set_takes_a_step() -> None:
     view = read_config(FOLDER / "compact-view.yaml", ViewTraining)
     stereo = read_config(FOLDER / "compact-stereo.yaml", StereoTraining)
-    assert view.generator.virtual_focal_px == stereo.matcher.work_focal_px
-    small = dataclasses.replace(stereo.matcher, blocks=(1, 1, 1, 1))
+    assert view.generator.virtual_focal_px == stereo.network_config.work_focal_px
+    small = dataclasses.replace(stereo.network_config, blocks=(1, 1, 1, 1))
     task = FinetuneTask(UNetGenerator(view.generator), PSMNet(small), FinetuneTraining(), None)
     (turn,) = task.step(pair(192, 256))
     turn.loss.backward()

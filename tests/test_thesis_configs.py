@@ -197,7 +197,7 @@ def test_the_matcher_is_trained_as_printed(monkeypatch: pytest.MonkeyPatch, tmp_
     assert found.learns(name) == 5_224_768
     assert found.betas(name) == (0.9, 0.999)
     assert found.rates(name, 0, 4, 5, 10, 15, 19) == [1e-4, 1e-4, 5e-5, 2.5e-5, 1.25e-5, 1.25e-5]
-    assert found.config.matcher.max_disparity_px == 192
+    assert found.config.network_config.max_disparity_px == 192
     assert (len(found.samples), found.steps) == (23_488, 20 * 23_488 // 4)
     assert found.samples.needs["needs_truth"]
     assert found.samples.config.augment == PairsConfig().augment
@@ -210,7 +210,7 @@ def test_fine_tuning_moves_the_generator_alone(
     """Chapter 2.5.3: 60 epochs, depth as the only supervision, the matcher as it is."""
     view = read_config(CONFIGS / "depth/view.yaml", ViewTraining)
     stereo = read_config(CONFIGS / "depth/stereo.yaml", StereoTraining)
-    made = {"generator": UNetGenerator(view.generator), "matcher": PSMNet(stereo.matcher)}
+    made = {"generator": UNetGenerator(view.generator), "matcher": PSMNet(stereo.network_config)}
     monkeypatch.setattr(depth_runs, "find_weights", Path)
     for reader, part in (("read_generator", "generator"), ("read_matcher", "matcher")):
         monkeypatch.setattr(depth_runs, reader, lambda _, n=made[part]: n)

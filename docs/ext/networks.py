@@ -64,7 +64,7 @@ def depth_networks() -> DepthNetworks:
         return DepthNetworks(
             UNetGenerator(view.generator),
             Discriminator("patch", view.discriminator_width),
-            PSMNet(stereo.matcher).eval(),
+            PSMNet(stereo.network_config).eval(),
             view.pairs.augment.crop_px,
         )
 

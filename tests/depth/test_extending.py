@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -140,7 +141,8 @@ def test_extending_matchers_with_training(
     assert float(turn.facts["epe"]) == pytest.approx(1.0)
 
     # A training by its config, as the command reads it from YAML.
-    words = {"other": {"flat": {"most_px": 12.0}}, "loop": {"steps": 1, "batch_size": 1}}
+    words: dict[str, Any] = {"kind": "flat", "network": {"most_px": 12.0}}
+    words["loop"] = {"steps": 1, "batch_size": 1}
     words["pairs"] = {"folders": [str(pairs)], "augment": {"crop_px": [16, 16]}}
     training = config_from_dict(words, StereoTraining, source="flat.yaml")
     trained = read_depth_weights(

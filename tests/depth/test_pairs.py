@@ -11,7 +11,7 @@ from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import read_json, write_depth_png, write_image
 from depthpose.core.loop import LoopConfig, TrainingRun
-from depthpose.depth.config import AugmentConfig, PairsConfig, PSMNetConfig, StreetsConfig
+from depthpose.depth.config import AugmentConfig, PairsConfig, StreetsConfig
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.train import TrainingPairs, train_stereo
 from depthpose.depth.train.config import StereoTraining
@@ -121,7 +121,7 @@ def test_the_record_of_a_run_says_the_truth_of_each_folder(tmp_path: Path) -> No
     make_pairs(home)
     write_depth_png(home / "lidar_depth" / "0.png", torch.full((60, 80), 10.0))
     config = StereoTraining(
-        matcher=PSMNetConfig(width=4, max_disparity_px=48, blocks=(1, 1, 1, 1), pools=(4, 2)),
+        network={"width": 4, "max_disparity_px": 48, "blocks": [1, 1, 1, 1], "pools": [4, 2]},
         pairs=PairsConfig(
             folders=(str(home),),
             streets=StreetsConfig(frames=1, scale=0.2),

@@ -118,18 +118,20 @@ def test_a_sure_mixture_is_one_shift(scale: float) -> None:
 
 @pytest.mark.parametrize("size", [(64, 96), (50, 70), (33, 31), (5, 7)])
 def test_any_size_is_answered_at_its_own_size(size: tuple[int, int]) -> None:
-    drawn = make_synthesiser(tiny()).draw(torch.rand(2, 3, *size))
+    drawn = make_synthesiser(tiny()).synthesise(torch.rand(2, 3, *size))
     assert drawn.right.shape == (2, 3, *size)
-    for part in (drawn.disparity_px, drawn.confidence, drawn.is_sky):
-        assert part is not None
-        assert part.shape == (2, *size)
-    assert drawn.disparity_px is not None
-    assert bool((drawn.disparity_px > 0).all())
+    assert drawn.matches is not None
+    assert len(drawn.matches) == 2
+    for match in drawn.matches:
+        for part in (match.disparity_px, match.confidence, match.is_sky):
+            assert part is not None
+            assert part.shape == size
+        assert bool((match.disparity_px > 0).all())
 
 
 def test_neighbours_in_a_batch_change_nothing() -> None:
     drawer, images = make_synthesiser(tiny()), torch.rand(2, 3, 64, 64)
-    both, alone = drawer.draw(images), drawer.draw(images[:1])
+    both, alone = drawer.synthesise(images), drawer.synthesise(images[:1])
     torch.testing.assert_close(both.right[:1], alone.right, rtol=0, atol=1e-5)
 
 

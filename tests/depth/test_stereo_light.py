@@ -11,7 +11,7 @@ from tests.depth.random_norms import with_random_norms
 
 from depthpose.core.camera import Camera
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
-from depthpose.core.config import read_config, write_config
+from depthpose.core.config import config_to_dict, read_config, write_config
 from depthpose.core.errors import InputError
 from depthpose.core.loop import LoopConfig, TrainingRun
 from depthpose.depth.augment import TrainingPair
@@ -156,7 +156,9 @@ def test_weights_without_the_sky_are_trained_on_with_it(tmp_path: Path) -> None:
     network = random_network(plain)
     facts = {"licence": "MIT", "trained_on": "nothing"}
     write_depth_weights(start, matcher=network, facts=facts)
-    config = StereoTraining(light=SMALL, start=str(start), sky_weight=0.5)
+    config = StereoTraining(
+        kind="light", network=config_to_dict(SMALL), start=str(start), sky_weight=0.5
+    )
     found = make_matcher_network(config)
     assert isinstance(found, LightStereo)
     pair = torch.randn(2, 1, 3, 32, 64).unbind()
@@ -164,7 +166,7 @@ def test_weights_without_the_sky_are_trained_on_with_it(tmp_path: Path) -> None:
         assert torch.equal(found.eval()(*pair)[-1], network(*pair)[-1])
     write_depth_weights(start, matcher=found, facts=facts)
     with pytest.raises(InputError, match="with_sky = True, but the config says False"):
-        make_matcher_network(dataclasses.replace(config, light=plain))
+        make_matcher_network(dataclasses.replace(config, network=config_to_dict(plain)))
 
 
 def test_the_refinement_compares_the_views_around_a_disparity() -> None:
@@ -318,7 +320,9 @@ def training_batch() -> TrainingPair:
 def stereo_task(**settings: Any) -> StereoTask:  # noqa: ANN401
     torch.manual_seed(0)
     return StereoTask(
-        LightStereo(SMALL), StereoTraining(light=SMALL, sky_weight=0.5, **settings), None
+        LightStereo(SMALL),
+        StereoTraining(kind="light", network=config_to_dict(SMALL), sky_weight=0.5, **settings),
+        None,
     )
 
 
@@ -404,8 +408,13 @@ def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     pairs = PairsConfig(streets=StreetsConfig(frames=2, scale=0.1))
     run, loop = TrainingRun(folder=tmp_path / "run"), LoopConfig(steps=1)
     with pytest.raises(InputError, match="give --encoder"):
-        train_stereo(StereoTraining(light=SMALL, sky_weight=0.5, pairs=pairs, loop=loop), run)
-    with pytest.raises(InputError, match="give the config a light network"):
+        train_stereo(
+            StereoTraining(
+                kind="light", network=config_to_dict(SMALL), sky_weight=0.5, pairs=pairs, loop=loop
+            ),
+            run,
+        )
+    with pytest.raises(InputError, match="give the config the light network"):
         train_stereo(StereoTraining(encoder="x.safetensors", pairs=pairs, loop=loop), run)
     other = tmp_path / "psmnet.safetensors"
     tiny = PSMNetConfig(width=2, max_disparity_px=16, blocks=(1, 1, 1, 1), pools=(2,))
@@ -413,7 +422,14 @@ def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     write_depth_weights(other, matcher=PSMNet(tiny), facts=facts)
     with pytest.raises(InputError, match="weights of PSMNet, but the config trains LightStereo"):
         train_stereo(
-            StereoTraining(light=SMALL, sky_weight=0.5, start=str(other), pairs=pairs, loop=loop),
+            StereoTraining(
+                kind="light",
+                network=config_to_dict(SMALL),
+                sky_weight=0.5,
+                start=str(other),
+                pairs=pairs,
+                loop=loop,
+            ),
             run,
         )
     two_deep = dataclasses.replace(SMALL, max_disparity_px=64)
@@ -421,18 +437,30 @@ def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     if not torch.cuda.is_available():
         with pytest.raises(InputError, match="max_disparity_px 96, or precision fp32"):
             train_stereo(
-                StereoTraining(light=two_deep, sky_weight=0.5, pairs=pairs, loop=loop), run
+                StereoTraining(
+                    kind="light",
+                    network=config_to_dict(two_deep),
+                    sky_weight=0.5,
+                    pairs=pairs,
+                    loop=loop,
+                ),
+                run,
             )
 
 
-def test_one_network_is_given(tmp_path: Path) -> None:
+def test_a_run_records_every_setting_of_its_network(tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
-    path.write_text("light: {width: 8}\n")
+    path.write_text("kind: light\nnetwork: {width: 8}\n")
     light = read_config(path, StereoTraining)
+    assert light.network_config == LightConfig(width=8)
     write_config(path, light)
+    assert "volume_widths" in path.read_text()
     assert read_config(path, StereoTraining) == light, "as a resumed run reads it"
-    path.write_text("light: {width: 8}\nmatcher: {width: 16}\n")
-    with pytest.raises(InputError, match="matcher and light are given, and one network"):
+    path.write_text("kind: lite\n")
+    with pytest.raises(InputError, match="light"):
+        read_config(path, StereoTraining)
+    path.write_text("kind: light\nnetwork: {blocks: [1, 1, 1, 1]}\n")
+    with pytest.raises(InputError, match="unknown key 'blocks'"):
         read_config(path, StereoTraining)
     path.write_text("with_frozen_stem: false\n")
     with pytest.raises(InputError, match="encoder of the light network, which PSMNet does not"):

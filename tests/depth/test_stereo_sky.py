@@ -11,6 +11,7 @@ from tests.depth.test_stereo_light import SMALL, random_network, shifted_pair, t
 from tests.synthetic_street import make_street
 
 from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.config import config_to_dict
 from depthpose.core.draw import draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.depth.augment import TrainingPair
@@ -107,7 +108,13 @@ def test_the_loss_is_the_cross_entropy_where_the_sky_is_known() -> None:
 
 def test_the_sky_is_learnt_as_a_class_and_not_as_a_disparity() -> None:
     torch.manual_seed(0)
-    config = StereoTraining(light=SMALL, with_frozen_stem=False, encoder_rate=1.0, sky_weight=1.0)
+    config = StereoTraining(
+        kind="light",
+        network=config_to_dict(SMALL),
+        with_frozen_stem=False,
+        encoder_rate=1.0,
+        sky_weight=1.0,
+    )
     task = StereoTask(LightStereo(SMALL), config, None)
     batch = training_batch()
     for view in (batch.left, batch.right):
@@ -261,7 +268,7 @@ def test_held_out_pairs_measure_the_sky() -> None:
 
 def test_a_class_that_would_not_be_learnt_is_refused() -> None:
     with pytest.raises(InputError, match="the sky would not be learnt; set sky_weight"):
-        StereoTraining(light=SMALL)
+        StereoTraining(kind="light", network=config_to_dict(SMALL))
 
 
 def test_a_disparity_is_drawn_grey_in_the_sky() -> None:

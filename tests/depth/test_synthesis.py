@@ -83,7 +83,7 @@ def test_sides_must_be_multiples() -> None:
 
 @pytest.mark.parametrize("size", [(16, 32), (5, 7), (1, 1), (33, 100)])
 def test_any_size_is_drawn_at_its_own_size(size: tuple[int, int]) -> None:
-    right = make_synthesiser(small()).draw(torch.rand(1, 3, *size)).right[0]
+    right = make_synthesiser(small()).synthesise(torch.rand(1, 3, *size)).right[0]
     assert right.shape == (3, *size)
     assert float(right.min()) >= 0
     assert float(right.max()) <= 1
@@ -107,9 +107,9 @@ def test_drawing_is_differentiable_to_the_weights() -> None:
 def test_running_mode_is_deterministic_and_does_not_depend_on_neighbours() -> None:
     drawer = make_synthesiser(_warmed(small()))
     one, other = torch.rand(2, 1, 3, 16, 32)
-    assert torch.equal(drawer.draw(one).right, drawer.draw(one).right)
-    both = drawer.draw(torch.cat([one, other])).right
-    torch.testing.assert_close(both[:1], drawer.draw(one).right)
+    assert torch.equal(drawer.synthesise(one).right, drawer.synthesise(one).right)
+    both = drawer.synthesise(torch.cat([one, other])).right
+    torch.testing.assert_close(both[:1], drawer.synthesise(one).right)
 
 
 def _warmed(network: UNetGenerator) -> UNetGenerator:

@@ -276,7 +276,7 @@ def test_a_mask_that_does_not_fit_its_frame_does_not_end_the_sequence() -> None:
         frames = list(views)
         frames[number] = replace(views[number], mask=everywhere[:30])
         for first in (None, poses[0]):
-            found = list(oracle(poses).track_in(frames, "bracket", first))
+            found = list(oracle(poses).track(frames, object="bracket", first=first))
             assert found[number].status == "unreadable"
             assert said in found[number].reason
             assert [one.is_ok for one in found] == [k != number for k in range(3)]

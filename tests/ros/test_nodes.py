@@ -182,7 +182,7 @@ class KnowsPose:
             covariance=torch.eye(6) * 1e-6, alternatives=(other,), pick_rank=1,
         )  # fmt: skip
 
-    def find_in(self, view: ViewInput, objects: list[str]) -> list[Any]:
+    def find(self, view: ViewInput, *, objects: list[str]) -> list[Any]:
         return [self.answer(), *(nothing_found(view, name, [], 0.0) for name in objects[1:])]
 
     def estimate(self, *, mask: np.ndarray, object: str, **_: object) -> Any:  # noqa: ANN401, ARG002
@@ -342,7 +342,7 @@ def test_the_node_of_poses_searches_before_an_empty_frame(
     write_depth_png(tmp_path / "empty.png", empty_m, 0.001)
     node = poses_node(monkeypatch, empty_frame=str(tmp_path / "empty.png"))
     searched: list[ViewInput] = []
-    monkeypatch.setattr(KnowsPose, "find_in", lambda _, view, __: searched.append(view) or [])
+    monkeypatch.setattr(KnowsPose, "find", lambda _, view, **__: searched.append(view) or [])
     node._poses.estimates(depth, info)
     node.destroy_node()
     (view,) = searched

@@ -116,7 +116,7 @@ class Poses:
         if mask is None:
             names = wanted or [*self.net.objects]
             view = view_input(depth_m, None, camera, names[0], "depth")
-            return self.net.find_in(add_background(view, self.background, camera), names)
+            return self.net.find(add_background(view, self.background, camera), objects=names)
         if len(wanted) > 1:
             raise InputError(
                 f"a mask is of one object, and {', '.join(wanted)} are asked for; ask for one, or "

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.devices import usable_device
@@ -24,7 +24,7 @@ from depthpose.depth.generators import (
     SelectionGenerator,
     UNetGenerator,
 )
-from depthpose.depth.types import Maps, Views
+from depthpose.depth.types import Maps, Match, Views
 
 _MAX_SHARE_OF_RANGE = 0.4
 """Share of the largest disparity of the planes up to which an estimate is trusted: above it
@@ -151,15 +151,14 @@ much."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SynthesisedViews:
-    """Right views of left images; and maps of the left views where the generator estimates them."""
+    """Right views of left images, and what a selecting generator estimates beside them."""
 
     right: Views  #: the right views, RGB in [0, 1]
-    disparity_px: Maps | None = None  #: disparity of the left views, without the sky
-    #: probability of disparities within 15 % of ``disparity_px``; in the sky that of the sky
-    confidence: Maps | None = None
-    is_sky: Bool[Tensor, "b h w"] | None = None  #: where the sky is more probable than not
-    #: probability that an image shows a street; None where the weights do not say
-    street_probability: Float[Tensor, " b"] | None = None
+    #: disparity, confidence and sky of each left view by the generator itself; None by a U-Net
+    matches: list[Match] | None = None
+    #: confidence in each image as a whole: the probability that it shows a street, or, where the
+    #: weights do not say that, the mean confidence; None by a U-Net
+    image_confidence: Float[Tensor, " b"] | None = None
 
 
 class SelectionSynthesiser:
@@ -181,7 +180,7 @@ class SelectionSynthesiser:
         self.scales = (1.0, 1.4) if speed == "fine" else (1.0,)
 
     @torch.no_grad()
-    def draw(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
+    def synthesise(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
         """Synthesise right views; images are RGB in [0, 1].
 
         Args:
@@ -210,15 +209,22 @@ class SelectionSynthesiser:
         is_sky = left_estimate.sky > 0.5
         disparity_confidence = left_estimate.confidence * (1 - left_estimate.sky)
         confidence = torch.where(is_sky, left_estimate.sky, disparity_confidence)
-        street_probability = left_estimate.street_probability
-        if street_probability is not None:
-            street_probability = street_probability.to(left.device)
+        image_confidence = left_estimate.street_probability
+        if image_confidence is None:
+            image_confidence = confidence.mean((1, 2))
+        matches = [
+            Match(disparity_px=disparity_px, confidence=sure, is_sky=sky)
+            for disparity_px, sure, sky in zip(
+                left_estimate.disparity_px.to(left.device),
+                confidence.to(left.device),
+                is_sky.to(left.device),
+                strict=True,
+            )
+        ]
         return SynthesisedViews(
             right=right.to(left.device),
-            disparity_px=left_estimate.disparity_px.to(left.device),
-            confidence=confidence.to(left.device),
-            is_sky=is_sky.to(left.device),
-            street_probability=street_probability,
+            matches=matches,
+            image_confidence=image_confidence.to(left.device),
         )
 
 
@@ -236,7 +242,7 @@ class UNetSynthesiser:
         self.config = generator.config
 
     @torch.no_grad()
-    def draw(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
+    def synthesise(self, left: Views, *larger: Float[Tensor, "b 3 _ _"]) -> SynthesisedViews:
         """Synthesise right views; images are RGB in [0, 1], and there are no ``larger`` ones.
 
         Raises:

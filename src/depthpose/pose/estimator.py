@@ -288,65 +288,53 @@ class PoseEstimator:
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
         return self.estimate_many(views)
 
+    @torch.no_grad()
     @force_float32()
     def find(
         self,
-        depth: AnyArray,
-        camera: AnyCamera,
+        depth: AnyArray | ViewInput,
+        camera: AnyCamera | None = None,
         objects: Sequence[str] | str | None = None,
         unit: Unit | None = None,
         background: AnyBackground | None = None,
     ) -> list[PoseEstimate]:
-        """Find and pose known objects in a depth image without masks, the best answer first.
+        """Find and pose known objects in a depth image without masks.
 
         Point pairs of the whole image vote for poses of each object; where the image agrees with
-        one, the object is estimated from the points there. What is refused is left out.
+        one, the object is estimated from the points there.
 
         Args:
-            depth: as for :meth:`estimate`.
+            depth: as for :meth:`estimate`; or a view with all of this but the objects, of which
+                only the mask is searched.
             camera: of the depth image.
             objects: which may be there, or which one; None: all that are known.
             unit: of the depth, where its camera says none.
             background: as for :meth:`estimate`.
 
         Returns:
-            Estimates that have a pose, ok or ambiguous; none where nothing was found.
+            An estimate for each instance that was found, the best first. Then, for each object that
+            was not found, a refusal (``is_posed`` is False) that says what the nearest miss was.
 
         Raises:
-            InputError: as for :meth:`estimate`.
+            InputError: as for :meth:`estimate`; or ``objects`` names none.
         """
         asked = [objects] if isinstance(objects, str) else objects
-        names = (
-            self.objects
-            if asked is None
-            else [self._find_object(name).model.name for name in asked]
-        )
-        # A view names one object, which a search does not read.
-        view = view_input(depth, None, camera, self.objects[0], _NAME, unit)
-        view = add_background(view, background, camera, unit)
-        return [estimate for estimate in self.find_in(view, names) if estimate.is_posed]
-
-    @torch.no_grad()
-    @force_float32()
-    def find_in(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
-        """Do as :meth:`find` does for a view, with a refusal for each object that is not found.
-
-        A refusal says what the nearest miss was. Only the mask of the view is searched.
-
-        Args:
-            view: depth and camera.
-            objects: which may be there.
-
-        Raises:
-            InputError: an unknown object, or none.
-        """
-        if not objects:
+        names = list(self.objects)
+        if asked is not None:
+            names = [self._find_object(name).model.name for name in asked]
+        if not names:
             raise InputError("find: objects names none; give those that may be there, or omit it")
-        return find_objects(view, self._targets(objects))
+        if isinstance(depth, ViewInput):
+            view = depth
+        else:
+            # A view names one object, which a search does not read.
+            view = view_input(depth, None, camera, names[0], _NAME, unit)
+            view = add_background(view, background, camera, unit)
+        return find_objects(view, self._targets(names))
 
     def track(
         self,
-        frames: Iterable[AnyArray | None],
+        frames: Iterable[AnyArray | AnyInput | PoseEstimate | None],
         camera: AnyCamera | None = None,
         object: str | None = None,
         first: Rigid | AnyArray | None = None,
@@ -361,8 +349,9 @@ class PoseEstimator:
         Args:
             frames: depth images as for :meth:`estimate`, in their order; without a camera clouds in
                 the camera frame, of the object alone, or of what is about it too: in these it is
-                looked for only where it was, so they need ``first``. They are taken one
-                by one, as their estimates are taken.
+                looked for only where it was, so they need ``first``. They are taken one by one, as
+                their estimates are taken. Views and clouds that are read already are taken too; in
+                a view only its mask is searched.
             camera: of the depth images.
             object: which one; None where one alone is known.
             first: the pose in the first frame, as far as it is known, or its 4x4 matrix in metres;
@@ -372,24 +361,33 @@ class PoseEstimator:
         Yields:
             An estimate for each frame, whose ``tracking`` is ``tracked``, ``found`` or ``lost``. A
             frame that cannot be taken, as None or an image of another size than the camera's, has
-            the status ``unreadable`` and costs the others nothing.
+            the status ``unreadable`` and costs the others nothing. An estimate in place of a frame,
+            which says why it cannot be read, stays as it is.
 
         Raises:
-            InputError: an unknown object, or a ``first`` that is no pose.
+            InputError: an unknown object, a ``first`` that is no pose, or an estimator that cannot
+                search without one.
         """
-        which = self._find_object(object).model.name
+        prepared = self._find_object(object)
+        which = prepared.model.name
         if isinstance(frames, str | Path):
             raise InputError(
                 f"track: frames is {str(frames)!r}, one path; give a list of files or arrays in "
                 "their order, such as list_images of depthpose.core.files gives of a folder"
             )
         start = None if first is None else rigid_input(first)
+        if self.needs_mask and start is None:
+            raise InputError(NEEDS_MASK)
         convert = partial(cloud_input, unit=unit or "m", object=which)
         if camera is not None:
             convert = partial(view_input, mask=None, camera=camera, object=which, unit=unit)
 
-        def read(number: int, frame: AnyArray | None) -> AnyInput | PoseEstimate:
+        def read(
+            number: int, frame: AnyArray | AnyInput | PoseEstimate | None
+        ) -> AnyInput | PoseEstimate:
             """Read a frame; one that cannot be read is an estimate that says so."""
+            if isinstance(frame, AnyInput | PoseEstimate):
+                return frame
             name = f"{_NAME}_{number}"
             reason = f"{name}: there is no frame, a None in its place"
             if frame is not None:
@@ -399,31 +397,15 @@ class PoseEstimator:
                     reason = str(error)
             return PoseEstimate(name=name, object=which, status="unreadable", reason=reason)
 
-        inputs = (read(number, frame) for number, frame in enumerate(frames))
-        return self.track_in(inputs, which, start)
-
-    def track_in(
-        self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None = None
-    ) -> Iterator[PoseEstimate]:
-        """Do as :meth:`track` does for views and clouds; in a view only its mask is searched.
-
-        In place of a frame that cannot be read there is an estimate that says so.
-
-        Raises:
-            InputError: an unknown object, or an estimator that cannot search without a ``first``.
-        """
-        if self.needs_mask and first is None:
-            raise InputError(NEEDS_MASK)
-
         @torch.no_grad()
         def search(pose_input: AnyInput) -> PoseEstimate:
             """Pose the object in a frame without a pose of the frame before."""
             if isinstance(pose_input, CloudInput):
                 return self._estimate(pose_input, is_expected=False)
-            return find_objects(pose_input, self._targets([object], "one at most"))[0]
+            return find_objects(pose_input, self._targets([which], "one at most"))[0]
 
-        prepared = self._find_object(object).prepare()
-        estimates = track(frames, prepared, self.config, search, first)
+        inputs = (read(number, frame) for number, frame in enumerate(frames))
+        estimates = track(inputs, prepared.prepare(), self.config, search, start)
         return iterate_in_float32(estimates)
 
     def surface_of(self, object: str) -> Surface:

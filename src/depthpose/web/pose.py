@@ -135,7 +135,7 @@ def _search(target: _Target, view: ViewInput) -> list[_ShownPose]:
     """Search a whole depth image for the object: an estimate for each copy that is found."""
     surface = target.net.surface_of(target.model.name)
     shown_poses: list[_ShownPose] = []
-    for estimate in target.net.find_in(view, [target.model.name]):
+    for estimate in target.net.find(view, objects=target.model.name):
         shown_view = replace(view, name=estimate.name)
         if estimate.camera_from_model is not None:
             mask = explained_mask(view, estimate.camera_from_model, surface)

@@ -57,13 +57,13 @@ class PoseMethod:
 
     def find(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
         """Estimate the poses of named objects in a view without a mask."""
-        return [self._in_base(estimate) for estimate in self.estimator.find_in(view, objects)]
+        return [self._in_base(estimate) for estimate in self.estimator.find(view, objects=objects)]
 
     def track(
         self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None
     ) -> Iterator[PoseEstimate]:
         """Follow an object through frames, perhaps from a first pose."""
-        return map(self._in_base, self.estimator.track_in(frames, object, first))
+        return map(self._in_base, self.estimator.track(frames, object=object, first=first))
 
     def _in_base(self, estimate: PoseEstimate) -> PoseEstimate:
         """Add the pose from the robot's base to an estimate, where the base is known."""

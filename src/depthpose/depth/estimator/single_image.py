@@ -67,23 +67,20 @@ def _estimate_one_size(
     lefts = [
         torch.stack([resize_image(image.left.float(), *size) for image in images]) for size in sizes
     ]
-    views = synthesiser.draw(*lefts)
+    views = synthesiser.synthesise(*lefts)
     matches = _match_views(synthesiser, matcher, lefts[0], views)
 
     estimates: list[DepthEstimate] = []
     for index, image in enumerate(images):
-        match = matches[index]
-        if views.is_sky is not None:
-            match = replace(match, is_sky=views.is_sky[index])
         size = image.left.shape[1:]
         estimate = estimate_from_virtual(
             image,
-            resize_match(match, *size),
+            resize_match(matches[index], *size),
             resize_image(views.right[index], *size),
             synthesiser.config.virtual_baseline_m,
         )
-        image_confidence = _estimate_image_confidence(views, index)
-        if image_confidence is not None:
+        if views.image_confidence is not None:
+            image_confidence = float(views.image_confidence[index])
             warning = _check_in_distribution(synthesiser, image.name, image_confidence, allow_ood)
             estimate = replace(
                 estimate,
@@ -139,29 +136,22 @@ def virtual_sizes(
 def _match_views(
     synthesiser: Synthesiser, matcher: Matcher | None, left: Views, views: SynthesisedViews
 ) -> list[Match]:
-    """Match images with their synthesised views, or take the synthesiser's own disparity."""
-    if synthesiser.config.answer != "matched":
-        assert views.disparity_px is not None, "its answer is its own disparity"
-        assert views.confidence is not None
-        maps = zip(views.disparity_px, views.confidence, strict=True)
-        return [
-            Match(disparity_px=disparity_px, confidence=confidence)
-            for disparity_px, confidence in maps
-        ]
+    """Match images with their synthesised views, or take the generator's own disparity."""
+    if synthesiser.config.answer == "own":
+        assert views.matches is not None, "a generator that answers itself has them"
+        return views.matches
     assert matcher is not None, "FakestereoNet checked it"
     camera = camera_of(synthesiser.config.virtual_focal_px, (left.shape[3], left.shape[2]))
-    return [
+    matches = [
         match_in_usual_range(matcher, *pair, camera) for pair in zip(left, views.right, strict=True)
     ]
-
-
-def _estimate_image_confidence(views: SynthesisedViews, index: int) -> float | None:
-    """Return the generator's confidence in an image as a whole, 0..1; None where it has none."""
-    if views.street_probability is not None:
-        return float(views.street_probability[index])
-    if views.confidence is not None:
-        return float(views.confidence[index].mean())
-    return None
+    if views.matches is None:
+        return matches
+    # The generator knows the sky.
+    return [
+        replace(match, is_sky=by_generator.is_sky)
+        for match, by_generator in zip(matches, views.matches, strict=True)
+    ]
 
 
 def _check_in_distribution(

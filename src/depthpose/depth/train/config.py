@@ -1,18 +1,15 @@
 """Settings of the stages; the defaults of the thesis's three are its schedules (2.4.2, 2.5.3)."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from depthpose.core.config import config_from_dict
+from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig, TrainingConfig
 from depthpose.depth.config import (
     DegradeConfig,
     GeneratorConfig,
-    LightConfig,
-    NetworkConfig,
     PairsConfig,
-    PSMNetConfig,
     SelectionConfig,
 )
 from depthpose.depth.losses import ADVERSARIAL_LOSSES, GENERATOR_DISPARITY_LOSSES
@@ -150,15 +147,11 @@ class StereoTraining(TrainingConfig):
 
     WEIGHTS_SETTINGS: ClassVar[tuple[str, ...]] = ("start", "encoder")
 
-    matcher: PSMNetConfig = field(default_factory=PSMNetConfig)
-    """The network that is trained."""
+    kind: str = "psmnet"
+    """The network that is trained, by its name in ``depth.weights.MATCHERS``: psmnet, light."""
 
-    light: LightConfig | None = None
-    """Train this light network in place of ``matcher``."""
-
-    other: dict[str, dict[str, object]] = field(default_factory=dict)
-    """Train a network of another kind in its place: the name of the kind in
-    ``depth.weights.MATCHERS``, and its config."""
+    network: dict[str, object] = field(default_factory=dict)
+    """Settings of the network, those of the config of its kind; others have their defaults."""
 
     start: str | None = None
     """Weights of the whole network to begin with (or a whole set)."""
@@ -199,40 +192,25 @@ class StereoTraining(TrainingConfig):
     """Length, batches, seed and precision of the training."""
 
     def __post_init__(self) -> None:
-        self._refuse_several_networks()
-        for kind in self.other:
-            refuse_unknown("other", kind, MATCHERS)
+        refuse_unknown("kind", self.kind, MATCHERS)
         super().__post_init__()
+        # With every default, so that the config that a run writes is a full record.
+        object.__setattr__(self, "network", config_to_dict(self.network_config))
         self._refuse_missing_encoder()
         self._refuse_unlearnt_sky()
-
-    def _refuse_several_networks(self) -> None:
-        """Refuse settings of more than one network."""
-        networks: list[str] = []
-        # A config that a run has written holds the defaults of ``matcher`` beside the others.
-        if self.matcher != PSMNetConfig():
-            networks.append("matcher")
-        if self.light is not None:
-            networks.append("light")
-        networks += self.other
-        if len(networks) > 1:
-            raise InputError(
-                f"{' and '.join(networks)} are given, and one network is trained; keep one"
-            )
 
     def _refuse_missing_encoder(self) -> None:
         """Refuse settings of an encoder for a network that has none."""
         # A setting counts as given where it differs from its default.
-        is_psmnet = self.light is None and not self.other
-        if is_psmnet and (self.encoder_rate != 0.3 or not self.with_frozen_stem):
+        if self.kind == "psmnet" and (self.encoder_rate != 0.3 or not self.with_frozen_stem):
             raise InputError(
                 "encoder_rate and with_frozen_stem are for the encoder of the light network, which "
-                "PSMNet does not have; leave them out, or give light"
+                "PSMNet does not have; leave them out, or give kind: light"
             )
 
     def _refuse_unlearnt_sky(self) -> None:
         """Refuse a class of the sky without weight, and training one that is not there."""
-        has_sky = bool(getattr(self.network, "with_sky", False))
+        has_sky = bool(getattr(self.network_config, "with_sky", False))
         if has_sky and self.sky_weight == 0:
             raise InputError(
                 "with_sky is true and sky_weight 0, so the sky would not be learnt; set sky_weight "
@@ -245,11 +223,9 @@ class StereoTraining(TrainingConfig):
             )
 
     @property
-    def network(self) -> NetworkConfig:
-        """Config of the network that is trained."""
-        for kind, settings in self.other.items():  # at most one
-            return config_from_dict(settings, MATCHERS[kind].config, source=f"other.{kind}")
-        return self.light or self.matcher
+    def network_config(self) -> Any:  # noqa: ANN401  the config of its kind
+        """Config of the network that is trained, a :class:`NetworkConfig` of its kind."""
+        return config_from_dict(self.network, MATCHERS[self.kind].config, source="network")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -87,13 +87,12 @@ def make_matcher_network(config: StereoTraining) -> StereoNetwork:
         InputError: the weights that the config names are of another network, or there is nothing
             to begin with for an encoder whose first layers are frozen.
     """
-    kind = next(kind for kind in MATCHERS.values() if isinstance(config.network, kind.config))
-    matcher = kind.network(config.network)
+    matcher = MATCHERS[config.kind].network(config.network_config)
     if config.encoder is not None:
         if matcher.encoder is None:
             raise InputError(
                 f"--encoder {config.encoder}: {type(matcher).__name__} has no encoder of its own "
-                "kind; give the config a light network (light: {}), or leave it out."
+                "kind; give the config the light network (kind: light), or leave it out."
             )
         load_encoder(matcher.encoder, find_weights(config.encoder))
     if matcher.encoder is not None:
@@ -188,8 +187,8 @@ def _refuse_wrong_gradients(config: StereoTraining) -> None:
     """
     # With torch 2.13, gradients of a 3x3x3 convolution over two planes in 16 bits are values near
     # 1e35 or NaN, while those over one, three or more planes agree with fp32 within 0.5 %.
-    step_px = config.network.step_px
-    is_two_deep = config.network.max_disparity_px == 2 * step_px
+    step_px = config.network_config.step_px
+    is_two_deep = config.network_config.max_disparity_px == 2 * step_px
     if is_two_deep and config.loop.precision == "bf16" and not torch.cuda.is_available():
         raise InputError(
             f"max_disparity_px is {2 * step_px} and precision bf16: at its coarsest the volume is "

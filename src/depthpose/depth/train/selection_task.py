@@ -183,15 +183,15 @@ class SelectTask:
         pictures: dict[str, Tensor] = {}
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
-            drawn = synthesiser.draw(pair.left[None])
-            assert drawn.disparity_px is not None
-            assert drawn.is_sky is not None
-            is_sky = drawn.is_sky[0]
-            predicted_px = drawn.disparity_px[0].where(~is_sky, 0.0).clamp(min=far_px)
+            views = synthesiser.synthesise(pair.left[None])
+            assert views.matches is not None
+            (match,) = views.matches
+            assert match.is_sky is not None
+            predicted_px = match.disparity_px.where(~match.is_sky, 0.0).clamp(min=far_px)
             if index == 0:
-                views = [pair.left, pair.right, drawn.right[0], draw_disparity(predicted_px)]
-                pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
-            measured.append(_measure_single(predicted_px, is_sky, pair.left_px, far_px))
+                shown = [pair.left, pair.right, views.right[0], draw_disparity(predicted_px)]
+                pictures["left_right_drawn_disparity"] = torch.cat(shown, 1)
+            measured.append(_measure_single(predicted_px, match.is_sky, pair.left_px, far_px))
         self._set_train_mode()
         return ValidationResult(numbers=average_metrics(measured), pictures=pictures)
 
