@@ -39,7 +39,7 @@ from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import CloudInput, Evidence, ObjectModel, PoseEstimate
 from depthpose.pose.verify.copies import find_copies
 from depthpose.pose.verify.evidence import compare, observe
-from depthpose.pose.verify.prepared_object import PreparedObject
+from depthpose.pose.verify.known_object import KnownObject
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 
@@ -316,19 +316,19 @@ def test_forty_models_take_bounded_time(net: Registration, monkeypatch: pytest.M
     registered = list[str]()
 
     def count(
-        cloud: CloudInput, prepared: PreparedObject, config: EstimateConfig, watch: Stopwatch,
+        cloud: CloudInput, known: KnownObject, config: EstimateConfig, watch: Stopwatch,
         **options: Any,  # noqa: ANN401
     ) -> PoseEstimate:  # fmt: skip
         registered.append(cloud.name)
-        return register(cloud, prepared, config, watch, **options)
+        return register(cloud, known, config, watch, **options)
 
     monkeypatch.setattr(search, "register", count)
-    prepared = net._find_object("bracket").prepare()
-    objects: dict[str, PreparedObject] = {}
+    known = net._find_object("bracket").prepare()
+    objects: dict[str, KnownObject] = {}
     for k in range(40):
-        model = replace(prepared.model, name=f"part {k}")
-        copy = PreparedObject(number=k, model=model)
-        copy.surface, copy.copies, copy.pairs = prepared.surface, prepared.copies, prepared.pairs
+        model = replace(known.model, name=f"part {k}")
+        copy = KnownObject(number=k, model=model)
+        copy.surface, copy.copies, copy.pairs = known.surface, known.copies, known.pairs
         objects[model.name] = copy
     targets = replace(TARGETS, objects=objects)
     began = time.process_time()
@@ -361,7 +361,7 @@ def judged(
     )
 
 
-PREPARED = PreparedObject(number=0, model=bracket())
+PREPARED = KnownObject(number=0, model=bracket())
 TARGETS = SearchTargets(
     objects={"a": PREPARED, "b": PREPARED, "c": PREPARED},
     config=EstimateConfig(),
@@ -472,11 +472,11 @@ def test_proposals_at_one_place_leave_room_for_others(
     net: Registration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sixty lie on a first part, and only then some on a second: these are looked at too."""
-    prepared = net._find_object("bracket").prepare()
+    known = net._find_object("bracket").prepare()
     truths = [pose_at(x_m).double() for x_m in (-0.15, 0.15)]
-    depth_m, _ = view_of(prepared.model, *(truth.float() for truth in truths))
+    depth_m, _ = view_of(known.model, *(truth.float() for truth in truths))
     view = view_input(depth_m.float(), None, CAMERA, "bracket", "x", None)
-    frame = prepare_frame(view.depth_m, view.K, prepared.surface.diameter_m)
+    frame = prepare_frame(view.depth_m, view.K, known.surface.diameter_m)
     first, second = truths
     names = ["a", "b"]
 
@@ -484,7 +484,7 @@ def test_proposals_at_one_place_leave_room_for_others(
         return Rigid.stack([first] * 30 + [second] * 3), torch.linspace(1.0, 0.5, 33)
 
     monkeypatch.setattr(search, "propose_in_frame", propose)
-    targets = replace(TARGETS, objects=dict.fromkeys(names, prepared))
+    targets = replace(TARGETS, objects=dict.fromkeys(names, known))
     everywhere = torch.ones_like(frame.depth_m, dtype=torch.bool)
     places = search._propose(frame, everywhere, names, [], targets)
     for name in names:
@@ -495,22 +495,22 @@ def test_proposals_at_one_place_leave_room_for_others(
 
 def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registration) -> None:
     """Each proposal is refined on what it explains: a coarse right one passes a wrong one."""
-    prepared = net._find_object("bracket").prepare()
+    known = net._find_object("bracket").prepare()
     truth = pose_at()
-    depth_m, _ = view_of(prepared.model, truth)
+    depth_m, _ = view_of(known.model, truth)
     view = view_input(depth_m.float(), None, CAMERA, "bracket", "x", None)
-    frame = prepare_frame(view.depth_m, view.K, prepared.surface.diameter_m)
+    frame = prepare_frame(view.depth_m, view.K, known.surface.diameter_m)
     half_turn = rotation_by(torch.tensor([0.0, 0.0, math.pi]).double())
     coarse = Rigid(truth.R.double(), truth.t_m.double() + torch.tensor([0.002, 0.001, 0.003]))
     wrong = Rigid(truth.R.double() @ half_turn, coarse.t_m)
     places = [
         search._Place(
             object="bracket", pose=pose,
-            explained=explained_frame_mask(frame, pose, prepared.surface),
+            explained=explained_frame_mask(frame, pose, known.surface),
         )
         for pose in (wrong, coarse)
     ]  # fmt: skip
-    targets = replace(TARGETS, objects={"bracket": prepared})
+    targets = replace(TARGETS, objects={"bracket": known})
     likely, hopeless = search._refine(places, frame, view, targets)
     assert float((likely[0].pose.t_m - truth.t_m).norm()) < 0.001, "refined"
     assert float(geodesic_rad(likely[0].pose.R.float(), truth.R.float())) < 0.1

@@ -43,7 +43,7 @@ from depthpose.pose.search import Instances, SearchTargets, find_objects
 from depthpose.pose.track import track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.verify.decide import choose_object, seconds_of_all
-from depthpose.pose.verify.prepared_object import PreparedObject
+from depthpose.pose.verify.known_object import KnownObject
 
 NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 _NAME = "input"  # what an input is called that came without a name
@@ -70,7 +70,7 @@ class PoseEstimator:
         self.objects = tuple(model.name for model in models)
         """Names of the objects."""
         self._known = {
-            model.name: PreparedObject(
+            model.name: KnownObject(
                 number=number,
                 model=model,
                 surface_points=self.config.icp.surface_points,
@@ -137,9 +137,9 @@ class PoseEstimator:
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        prepared = self._find_object(pose_input.object).prepare()
+        known = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
-        work = partial(register, pose_input, prepared, self.config, watch)
+        work = partial(register, pose_input, known, self.config, watch)
         estimate = answer(pose_input, watch, work)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
@@ -368,8 +368,8 @@ class PoseEstimator:
             InputError: an unknown object, a ``first`` that is no pose, or an estimator that cannot
                 search without one.
         """
-        prepared = self._find_object(object)
-        which = prepared.model.name
+        known = self._find_object(object)
+        which = known.model.name
         if isinstance(frames, str | Path):
             raise InputError(
                 f"track: frames is {str(frames)!r}, one path; give a list of files or arrays in "
@@ -405,7 +405,7 @@ class PoseEstimator:
             return find_objects(pose_input, self._targets([which], "one at most"))[0]
 
         inputs = (read(number, frame) for number, frame in enumerate(frames))
-        estimates = track(inputs, prepared.prepare(), self.config, search, start)
+        estimates = track(inputs, known.prepare(), self.config, search, start)
         return iterate_in_float32(estimates)
 
     def surface_of(self, object: str) -> Surface:
@@ -416,7 +416,7 @@ class PoseEstimator:
         """
         return self._find_object(object).surface
 
-    def _find_object(self, name: str | None) -> PreparedObject:
+    def _find_object(self, name: str | None) -> KnownObject:
         """Find an object by its name; None where one alone is known.
 
         Raises:

@@ -38,7 +38,7 @@ from depthpose.pose.verify.decide import (
     with_status,
 )
 from depthpose.pose.verify.evidence import compare, observe
-from depthpose.pose.verify.prepared_object import PreparedObject
+from depthpose.pose.verify.known_object import KnownObject
 from depthpose.pose.verify.probability import (
     LEAST_POSSIBLE,
     log_odds_right,
@@ -69,7 +69,7 @@ Instances = Literal["one", "one at most", "any number"]  #: see ``SearchTargets.
 class SearchTargets:
     """What is looked for."""
 
-    objects: Mapping[str, PreparedObject]  #: by their names
+    objects: Mapping[str, KnownObject]  #: by their names
     config: EstimateConfig  #: of ICP and limits
     #: how many of each object there are: ``one`` in a detector's box, ``one at most`` in a frame of
     #: a track, ``any number`` in another image.

@@ -13,7 +13,7 @@ _LEAST_POINTS = 500  # a model without faces and with fewer points has no surfac
 
 
 @dataclass(kw_only=True, eq=False)
-class PreparedObject:
+class KnownObject:
     """A known object; each part of what its model gives is computed at its first use, and kept."""
 
     number: int  #: among the models of an estimator
@@ -21,7 +21,7 @@ class PreparedObject:
     surface_points: int = 10_000  #: samples of its surface
     deviation_m: float | None = None  #: of the real surface, as :func:`prepare_surface` takes it
 
-    def prepare(self) -> "PreparedObject":
+    def prepare(self) -> "KnownObject":
         """Compute all parts now, in some seconds, so that the time of no input includes it."""
         _ = self.surface
         _ = self.copies
