@@ -15,7 +15,6 @@ others. Each is a depth image with a mask; with ``--clouds`` only the points in 
 refuses. ``--save`` writes status and evidence as JSON; then nothing is refused for its fit.
 """
 
-import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -27,7 +26,7 @@ from shared import make_parser, with_cpu_seconds
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import make_sample_generator
-from depthpose.pose.config import EstimateConfig, ObjectsConfig
+from depthpose.pose.config import EstimateConfig, ObjectsConfig, RefusalConfig
 from depthpose.pose.estimator import PoseEstimator
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
 from depthpose.pose.network_pose import GeoPoseNet
@@ -146,17 +145,17 @@ def main() -> None:
     parser.add_argument("--save", type=Path, help="a folder for the signals of each set")
     options = parser.parse_args()
     if options.save and options.method == "both":
-        parser.error("--save opens one refusal, and both methods have their own; save each alone")
+        parser.error("--save refuses nothing, so nothing is left to register; save each alone")
     torch.set_num_threads(1)
     kinds = options.kinds or [ITSELF, *negative_kinds()]
     for name in options.weights:
-        config = EstimateConfig(register_refused=options.method == "both")
+        config = EstimateConfig(
+            refusal=RefusalConfig(min_probability=0.0) if options.save else None,
+            register_refused=options.method == "both",
+        )
         net = GeoPoseNet.load(find_weights(name), config)
-        no_refusal = dataclasses.replace(net.refusal, min_probability=0.0)
         if options.method == "register":
-            net = Registration(net.models, refusal=no_refusal if options.save else None)
-        elif options.save:
-            net.weights = dataclasses.replace(net.weights, refusal=no_refusal)
+            net = Registration(net.models, config)
 
         groups: list[list[Row]] = []
         total_s = 0.0

@@ -17,7 +17,6 @@ runs.
 """
 
 import argparse
-import dataclasses
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +30,13 @@ from shared import make_parser, with_cpu_seconds
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorKind, SyntheticSensorConfig
+from depthpose.pose.config import (
+    EstimateConfig,
+    ObjectsConfig,
+    RefusalConfig,
+    SensorKind,
+    SyntheticSensorConfig,
+)
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m
@@ -99,11 +104,8 @@ def trained_methods(
 
 def without_refusal(name: str, files: Sequence[str], number: int) -> Iterator[Method]:
     """Yield a method of trained weights that answers every view whose points vote."""
-    nets = []
-    for file in files:
-        weights = read_pose_weights(find_weights(file))
-        refusal = dataclasses.replace(weights.refusal, min_probability=0.0)
-        nets.append(GeoPoseNet(dataclasses.replace(weights, refusal=refusal)))
+    config = EstimateConfig(refusal=RefusalConfig(min_probability=0.0))
+    nets = [GeoPoseNet(read_pose_weights(find_weights(file)), config) for file in files]
     yield from method_of_nets(name, nets, number)
 
 

@@ -70,8 +70,7 @@ def _content(value: object) -> object:
 def prepared_once() -> Iterator[None]:
     """What an estimator computes of a shape, and Git's answer, is computed once a process."""
     from depthpose.core import environment
-    from depthpose.pose import estimator
-    from depthpose.pose.verify import prepared_object
+    from depthpose.pose.verify import known_object
 
     made: dict[object, Any] = {}
 
@@ -85,9 +84,9 @@ def prepared_once() -> Iterator[None]:
         return give
 
     with pytest.MonkeyPatch.context() as patch:
-        surface = once(estimator.prepare_surface, lambda *given: _content(given))
-        patch.setattr(estimator, "prepare_surface", surface)
-        patch.setattr(prepared_object, "prepare_pairs", once(prepared_object.prepare_pairs, id))
+        surface = once(known_object.prepare_surface, lambda *given: _content(given))
+        patch.setattr(known_object, "prepare_surface", surface)
+        patch.setattr(known_object, "prepare_pairs", once(known_object.prepare_pairs, id))
         patch.setattr(environment, "_read_commit", cache(environment._read_commit))
         yield
 

@@ -21,7 +21,7 @@ from depthpose.pose.verify.hypotheses import (
 )
 from depthpose.pose.verify.probability import (
     PRIOR_EXPECTED,
-    PRIOR_PROPOSED,
+    PRIOR_UNEXPECTED,
     GammaShare,
     log_likelihood_ratio,
     probability_right,
@@ -69,7 +69,7 @@ def test_the_seconds_of_several_tries_add_up() -> None:
 
 
 def test_each_kind_of_contradiction_lowers_the_probability() -> None:
-    right = probability_right(GOOD, PRIOR_EXPECTED)
+    right = probability_right(GOOD, is_expected=True)
     assert right > 0.99
     for kind in ("seen_through", "bulging", "beside", "continued"):
         before = right
@@ -77,11 +77,11 @@ def test_each_kind_of_contradiction_lowers_the_probability() -> None:
         for patches in (2.0, 8.0, 20.0):
             evidence = replace(GOOD, supported=38.0 - patches, **{kind: patches})
             assert evidence.contradicted == patches
-            after = probability_right(evidence, PRIOR_EXPECTED)
+            after = probability_right(evidence, is_expected=True)
             assert after < before or after == before == 0, (kind, patches)
             before = after
         # Where the rest lies no nearer than it does by accident, it is refused.
-        assert probability_right(replace(evidence, rms=1.7), PRIOR_PROPOSED) < 0.1, kind
+        assert probability_right(replace(evidence, rms=1.7), is_expected=False) < 0.1, kind
 
 
 def test_a_surface_that_goes_on_across_half_of_the_silhouette_is_of_something_larger() -> None:
@@ -103,11 +103,11 @@ def test_what_was_not_observed_lowers_it_less_than_what_contradicts() -> None:
 def test_a_pose_that_a_search_proposed_needs_more_evidence_than_one_in_a_mask() -> None:
     evidence = replace(GOOD, supported=28.0, explained=28.0, unobserved=10.0, seen_through=2.0)
     masked, proposed = (
-        probability_right(evidence, odds) for odds in (PRIOR_EXPECTED, PRIOR_PROPOSED)
+        probability_right(evidence, is_expected=is_expected) for is_expected in (True, False)
     )
     assert masked > proposed
     odds = [p / (1 - p) for p in (masked, proposed)]
-    assert odds[0] / odds[1] == pytest.approx(PRIOR_EXPECTED / PRIOR_PROPOSED, rel=1e-6)
+    assert odds[0] / odds[1] == pytest.approx(PRIOR_EXPECTED / PRIOR_UNEXPECTED, rel=1e-6)
 
 
 def test_poses_share_the_probability_of_one() -> None:
@@ -208,10 +208,10 @@ def test_less_than_one_patch_says_nothing_for_a_pose() -> None:
 
 def test_a_pose_on_something_larger_is_refused_for_this_reason_beside_larger_areas() -> None:
     evidence = replace(GOOD, silhouette=20.0, continued=7.0, unobserved=30.0)
-    assert probability_right(evidence, 1e6) == 0
+    assert probability_right(evidence, is_expected=True) == 0
     assert "goes on beyond it" in explain_doubt(evidence, 0.0, is_masked=False)
     evidence = replace(evidence, continued=5.0)
-    assert probability_right(evidence, 1e6) > 0.5, "objects touch"
+    assert probability_right(evidence, is_expected=True) > 0.5, "objects touch"
     assert "was not observed" in explain_doubt(evidence, 0.0, is_masked=False)
 
 

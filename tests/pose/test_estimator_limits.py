@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
+from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, VotingConfig
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network_pose import CloudToPose
 from depthpose.pose.registration import Registration
@@ -46,7 +46,7 @@ def test_millions_of_points_are_answered_in_the_memory_of_few() -> None:
     cloud = seen.repeat(MILLIONS // len(seen) + 1, 1)[:MILLIONS]
     net = Oracle(tiny_weights(part), [truth])
     # Nothing grows beyond the cloud itself in 64 bits: no pairs, no grid, no tree of all points.
-    assert net.config == EstimateConfig()
+    assert net.config == EstimateConfig(refusal=RefusalConfig())
     with _Largest() as largest:
         found = net.estimate(cloud=cloud)
     assert found.status == "ok", found.reason

@@ -38,7 +38,7 @@ from depthpose.pose.types import (
 )
 from depthpose.pose.verify.decide import choose_object
 from depthpose.pose.verify.evidence import compare, observe
-from depthpose.pose.verify.probability import PRIOR_PROPOSED, probability_right
+from depthpose.pose.verify.probability import probability_right
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 REFUSAL = RefusalConfig()
@@ -109,7 +109,7 @@ def test_a_piece_of_a_larger_plane_is_no_flat_part(
     cloud_m = cloud_from_depth(depth_m, mask, K)
     observation = observe(cloud_m, view, surface, is_masked=False)
     evidence = compare(observation, pose, surface)
-    assert (probability_right(evidence, PRIOR_PROPOSED) == 0) == is_cut
+    assert (probability_right(evidence, is_expected=False) == 0) == is_cut
 
 
 def test_readings_on_a_posed_surface_are_all_that_are_near_it() -> None:

@@ -72,6 +72,20 @@ def test_what_is_hidden_is_less_certain_and_what_is_seen_through_less_still() ->
     assert through < 0.5
 
 
+def test_the_limits_of_the_weights_hold_for_every_pose_unless_the_config_has_others() -> None:
+    view = view_before_wall(bracket())
+    box = replace(view, is_region=True)
+    strict = RefusalConfig(min_probability=1.0)
+    weights = tiny_weights(bracket(), refusal=strict)
+    refused = Oracle(weights, [TRUTH]).estimate_many([view, box])
+    assert [estimate.status for estimate in refused] == ["doubtful", "doubtful"]
+    usual = EstimateConfig(refusal=RefusalConfig())
+    posed = Oracle(weights, [TRUTH], config=usual).estimate_many([view, box])
+    assert [estimate.status for estimate in posed] == ["ok", "ok"]
+    (registered,) = Registration([bracket()], EstimateConfig(refusal=strict)).estimate_many([view])
+    assert registered.status == "doubtful"
+
+
 def test_a_copy_of_another_size_is_no_answer() -> None:
     for times in (0.8, 1.25):
         refused = estimated(view_before_wall(scaled(bracket(), times)))

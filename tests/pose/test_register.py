@@ -18,9 +18,11 @@ from depthpose.pose.config import EstimateConfig, ObjectsConfig, VotingConfig
 from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.mesh import make_model, sample_surface
 from depthpose.pose.metrics import add_m
+from depthpose.pose.network_pose import CloudToPose
 from depthpose.pose.propose.point_pairs import prepare_pairs, propose_poses
+from depthpose.pose.refusals import Refused
 from depthpose.pose.synthetic import SyntheticViews, make_part
-from depthpose.pose.types import CloudSample, ObjectModel
+from depthpose.pose.types import CloudSample, ObjectModel, PoseEstimate
 from depthpose.pose.weights import read_pose_weights
 
 
@@ -155,13 +157,17 @@ def test_registration_without_icp_is_an_error() -> None:
         Registration([part()], EstimateConfig(with_icp=False))
 
 
+class Doubting(GeoPoseNet):
+    """A network that takes none of its own answers."""
+
+    def _estimate_by_votes(self, job: CloudToPose) -> PoseEstimate:
+        raise Refused("doubtful", f"{job.known.model.name} is doubted")
+
+
 @cache
 def doubting_net() -> GeoPoseNet:
-    """Trained weights that take none of their own answers."""
     weights = read_pose_weights(find_weights("parts"))
-    strict = replace(weights.refusal, min_probability=1.0)
-    nothing = replace(weights, refusal=strict)
-    return GeoPoseNet(nothing, EstimateConfig(register_refused=True))
+    return Doubting(weights, EstimateConfig(register_refused=True))
 
 
 def test_what_the_network_doubts_is_registered_where_wanted() -> None:
@@ -176,14 +182,13 @@ def test_what_the_network_doubts_is_registered_where_wanted() -> None:
         error_m = add_m(one.camera_from_model, sample.truth.camera_from_model, points_m)
         assert float(error_m) < 0.05 * model.diameter_m
         assert "network" in one.seconds
-    # Where everything agrees, nothing is left to doubt.
-    assert sum("registration" in one.seconds for one, _ in answered) >= 1
+        assert "registration" in one.seconds
 
 
 def test_registration_that_finds_nothing_leaves_the_network_s_reason() -> None:
     given = replace(view(make_part("mug"), 0).input, object="connector")
     found = doubting_net().estimate_many([given])[0]
-    assert found.status == "doubtful"
+    assert (found.status, found.reason) == ("doubtful", "connector is doubted")
     assert "registration" in found.seconds
 
 

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -38,8 +39,7 @@ from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import CloudInput, Evidence, ObjectModel, PoseEstimate
 from depthpose.pose.verify.copies import find_copies
 from depthpose.pose.verify.evidence import compare, observe
-from depthpose.pose.verify.prepared_object import PreparedObject
-from depthpose.pose.verify.probability import PRIOR_PROPOSED
+from depthpose.pose.verify.known_object import KnownObject
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 
@@ -268,11 +268,10 @@ def test_turns_that_fit_as_well_are_named() -> None:
     found = register(
         cloud,
         net._find_object("mug").prepare(),
-        net.config,
-        RefusalConfig(min_observability=0.0, min_probability=0.0),
+        EstimateConfig(refusal=RefusalConfig(min_observability=0.0, min_probability=0.0)),
         Stopwatch(),
         proposals=truth[None],
-        prior_odds=PRIOR_PROPOSED,
+        is_expected=False,
     )
     assert found.camera_from_model is not None
     named = [found.camera_from_model, *(one.camera_from_model for one in found.alternatives)]
@@ -317,21 +316,19 @@ def test_forty_models_take_bounded_time(net: Registration, monkeypatch: pytest.M
     registered = list[str]()
 
     def count(
-        cloud: CloudInput, prepared: PreparedObject, config: EstimateConfig,
-        refusal: RefusalConfig, watch: Stopwatch, *, proposals: Rigid, prior_odds: float,
+        cloud: CloudInput, known: KnownObject, config: EstimateConfig, watch: Stopwatch,
+        **options: Any,  # noqa: ANN401
     ) -> PoseEstimate:  # fmt: skip
         registered.append(cloud.name)
-        return register(
-            cloud, prepared, config, refusal, watch, proposals=proposals, prior_odds=prior_odds
-        )
+        return register(cloud, known, config, watch, **options)
 
     monkeypatch.setattr(search, "register", count)
-    prepared = net._find_object("bracket").prepare()
-    objects: dict[str, PreparedObject] = {}
+    known = net._find_object("bracket").prepare()
+    objects: dict[str, KnownObject] = {}
     for k in range(40):
-        model = replace(prepared.model, name=f"part {k}")
-        copy = PreparedObject(number=k, model=model, surface=prepared.surface)
-        copy.copies, copy.pairs = prepared.copies, prepared.pairs  # computed once
+        model = replace(known.model, name=f"part {k}")
+        copy = KnownObject(number=k, model=model)
+        copy.surface, copy.copies, copy.pairs = known.surface, known.copies, known.pairs
         objects[model.name] = copy
     targets = replace(TARGETS, objects=objects)
     began = time.process_time()
@@ -364,11 +361,10 @@ def judged(
     )
 
 
-PREPARED = PreparedObject(number=0, model=bracket(), surface=bracket_surface())
+PREPARED = KnownObject(number=0, model=bracket())
 TARGETS = SearchTargets(
     objects={"a": PREPARED, "b": PREPARED, "c": PREPARED},
     config=EstimateConfig(),
-    refusal=RefusalConfig(),
 )
 
 
@@ -442,7 +438,7 @@ def test_a_box_holds_one() -> None:
     places = of_one_object(math.log(20), math.log(20))
     remaining, _ = search._weigh_instances(places, TARGETS)
     assert len(remaining) == 2
-    remaining, misses = search._weigh_instances(places, replace(TARGETS, is_single=True))
+    remaining, misses = search._weigh_instances(places, replace(TARGETS, instances="one at most"))
     assert not remaining
     assert "49%" in misses[0].reason, "20 of 41"
 
@@ -476,11 +472,11 @@ def test_proposals_at_one_place_leave_room_for_others(
     net: Registration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sixty lie on a first part, and only then some on a second: these are looked at too."""
-    prepared = net._find_object("bracket").prepare()
+    known = net._find_object("bracket").prepare()
     truths = [pose_at(x_m).double() for x_m in (-0.15, 0.15)]
-    depth_m, _ = view_of(prepared.model, *(truth.float() for truth in truths))
+    depth_m, _ = view_of(known.model, *(truth.float() for truth in truths))
     view = view_input(depth_m.float(), None, CAMERA, "bracket", "x", None)
-    frame = prepare_frame(view.depth_m, view.K, prepared.surface.diameter_m)
+    frame = prepare_frame(view.depth_m, view.K, known.surface.diameter_m)
     first, second = truths
     names = ["a", "b"]
 
@@ -488,7 +484,7 @@ def test_proposals_at_one_place_leave_room_for_others(
         return Rigid.stack([first] * 30 + [second] * 3), torch.linspace(1.0, 0.5, 33)
 
     monkeypatch.setattr(search, "propose_in_frame", propose)
-    targets = replace(TARGETS, objects=dict.fromkeys(names, prepared))
+    targets = replace(TARGETS, objects=dict.fromkeys(names, known))
     everywhere = torch.ones_like(frame.depth_m, dtype=torch.bool)
     places = search._propose(frame, everywhere, names, [], targets)
     for name in names:
@@ -499,22 +495,22 @@ def test_proposals_at_one_place_leave_room_for_others(
 
 def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registration) -> None:
     """Each proposal is refined on what it explains: a coarse right one passes a wrong one."""
-    prepared = net._find_object("bracket").prepare()
+    known = net._find_object("bracket").prepare()
     truth = pose_at()
-    depth_m, _ = view_of(prepared.model, truth)
+    depth_m, _ = view_of(known.model, truth)
     view = view_input(depth_m.float(), None, CAMERA, "bracket", "x", None)
-    frame = prepare_frame(view.depth_m, view.K, prepared.surface.diameter_m)
+    frame = prepare_frame(view.depth_m, view.K, known.surface.diameter_m)
     half_turn = rotation_by(torch.tensor([0.0, 0.0, math.pi]).double())
     coarse = Rigid(truth.R.double(), truth.t_m.double() + torch.tensor([0.002, 0.001, 0.003]))
     wrong = Rigid(truth.R.double() @ half_turn, coarse.t_m)
     places = [
         search._Place(
             object="bracket", pose=pose,
-            explained=explained_frame_mask(frame, pose, prepared.surface),
+            explained=explained_frame_mask(frame, pose, known.surface),
         )
         for pose in (wrong, coarse)
     ]  # fmt: skip
-    targets = replace(TARGETS, objects={"bracket": prepared})
+    targets = replace(TARGETS, objects={"bracket": known})
     likely, hopeless = search._refine(places, frame, view, targets)
     assert float((likely[0].pose.t_m - truth.t_m).norm()) < 0.001, "refined"
     assert float(geodesic_rad(likely[0].pose.R.float(), truth.R.float())) < 0.1
@@ -552,7 +548,7 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
     assert [estimate.object for estimate in found] == ["a", "a", "a", "b"], "the surest first"
     assert [estimate.name for estimate in found] == ["x_0", "x_1", "x_2", "x_3"]
     searched.clear()
-    single = find_objects(view, replace(targets, is_single=True))
+    single = find_objects(view, replace(targets, instances="one at most"))
     assert [estimate.object for estimate in single] == ["a", "b"], "searched once, one of each"
 
 

@@ -23,13 +23,12 @@ from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose import track as track_module
 from depthpose.pose.background import add_background
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
 from depthpose.pose.refusals import Refused
-from depthpose.pose.track import TrackedObject, track
+from depthpose.pose.track import track
 from depthpose.pose.types import Alternative, PoseEstimate, ViewInput
-from depthpose.pose.verify.prepared_object import PreparedObject
+from depthpose.pose.verify.known_object import KnownObject
 
 HIDDEN = 0.68
 
@@ -108,20 +107,21 @@ def test_it_is_lost_where_it_is_taken_away_or_covered_and_found_when_back() -> N
 
 def test_a_track_that_its_history_ends_does_not_blame_the_frame() -> None:
     pose = pose_at(z_m=0.7, seed=3)
-    weights = tiny_weights(bracket())
-    target = TrackedObject(
-        prepared=PreparedObject(number=0, model=bracket(), surface=bracket_surface()),
-        refusal=weights.refusal,
-        config=EstimateConfig(),
-        search=lambda _: pytest.fail("not looked for anew"),
-    )
+    known = KnownObject(number=0, model=bracket())
     doubted = track_module._Track(pose=pose.double(), motion=None, log_odds=-9.0, first=None)
     depth_m = frame(pose)
     everywhere = torch.ones_like(depth_m, dtype=torch.bool)
     view = ViewInput(name="a", depth_m=depth_m, mask=everywhere, K=K.float(), object="bracket")
     said = "together with the frames before it the pose is right with a .* alone with 100%$"
     with pytest.raises(Refused, match=said):
-        track_module._follow(view, doubted, target)
+        track_module._follow(view, doubted, known, EstimateConfig())
+
+
+def test_what_is_computed_of_the_model_is_not_in_the_time_of_the_first_frame() -> None:
+    poses = moving(1)
+    net = oracle(poses)
+    net.track([frame(poses[0])], CAMERA, first=poses[0])
+    assert "copies" in vars(net._find_object("bracket")), "before any frame is taken"
 
 
 def test_a_part_that_is_hidden_does_not_lose_it() -> None:
@@ -219,16 +219,12 @@ def test_what_else_it_may_be_moves_along() -> None:
     )  # fmt: skip
     net = oracle(poses)
     model = net.weights.models[0]
-    known = TrackedObject(
-        prepared=PreparedObject(number=0, model=model, surface=prepare_surface(model)),
-        refusal=net.weights.refusal,
-        config=net.config, search=lambda _: start,
-    )  # fmt: skip
+    known = KnownObject(number=0, model=model)
     views = [back_project(frame(p).double(), K).reshape(-1, 3) for p in poses]
     from depthpose.pose.types import CloudInput
 
     inputs = [CloudInput(name=str(k), points_m=v, object="bracket") for k, v in enumerate(views)]
-    first, second = track(inputs, known)
+    first, second = track(inputs, known, net.config, search=lambda _: start)
     assert (first.tracking, second.tracking) == ("found", "tracked")
     assert second.certainty is not None
     assert second.copy_certainty is not None

@@ -131,7 +131,7 @@ class IcpConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class RefusalConfig(Settings):
-    """When an estimate is withheld."""
+    """When a pose is withheld."""
 
     min_probability: Annotated[float, "[0, 1]"] = 0.5
     """The best pose must be right with this probability, by what contradicts it in the image."""
@@ -162,6 +162,10 @@ class EstimateConfig(Settings):
     min_certainty: Annotated[float, "[0, 1]"] = 0.9
     """Below this certainty the status is ``ambiguous``, not ``ok``; pose and alternatives are given
     all the same. 0: the likeliest pose is always ``ok``."""
+
+    refusal: RefusalConfig | None = None
+    """When a pose is withheld. None: by the limits that a network's weights hold; of models alone
+    by the usual ones."""
 
     object_deviation_m: Annotated[float, "[0, 1]"] | None = None
     """Standard deviation of the real surface from the model: some tenths of a millimetre for a
@@ -200,6 +204,11 @@ class EstimateConfig(Settings):
                 "registration refines by ICP; omit --no-icp (with_icp=False) or "
                 "--register-refused (register_refused=True)"
             )
+
+    @property
+    def limits(self) -> RefusalConfig:
+        """The limits that ``refusal`` sets, or the usual ones."""
+        return self.refusal or RefusalConfig()
 
 
 DiameterTable = Literal["bop", "pvnet"]  #: see ``EvaluationConfig.diameters``

@@ -23,9 +23,9 @@ from depthpose.core.stopwatch import Stopwatch
 from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, add_background
 from depthpose.pose.color_inputs import add_color
-from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets.detections import Box, Detection, mask_view
-from depthpose.pose.geometry.surface import Surface, prepare_surface
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.inputs import (
     AnyArray,
     AnyCloud,
@@ -39,12 +39,11 @@ from depthpose.pose.inputs import (
 )
 from depthpose.pose.pipeline import register
 from depthpose.pose.refusals import answer, unreadable_on_error
-from depthpose.pose.search import SearchTargets, find_objects
-from depthpose.pose.track import TrackedObject, track
+from depthpose.pose.search import Instances, SearchTargets, find_objects
+from depthpose.pose.track import track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.verify.decide import choose_object, seconds_of_all
-from depthpose.pose.verify.prepared_object import PreparedObject
-from depthpose.pose.verify.probability import PRIOR_EXPECTED, PRIOR_PROPOSED
+from depthpose.pose.verify.known_object import KnownObject
 
 NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 _NAME = "input"  # what an input is called that came without a name
@@ -56,7 +55,6 @@ class PoseEstimator:
     Args:
         models: the objects.
         config: ICP, limits, device.
-        refusal: when what is registered, searched or tracked is withheld.
     """
 
     holder: ClassVar = "weights"
@@ -66,15 +64,20 @@ class PoseEstimator:
     expects_all: ClassVar = False
     """Whether every object is expected in every image, as that of a CAD file is."""
 
-    def __init__(
-        self, models: Sequence[ObjectModel], config: EstimateConfig | None, refusal: RefusalConfig
-    ) -> None:
+    def __init__(self, models: Sequence[ObjectModel], config: EstimateConfig | None) -> None:
         self.config = EstimateConfig() if config is None else config
         self.models = tuple(models)
-        self.refusal = refusal
         self.objects = tuple(model.name for model in models)
         """Names of the objects."""
-        self._prepared_objects: dict[str, PreparedObject] = {}  # by name, those asked for so far
+        self._known = {
+            model.name: KnownObject(
+                number=number,
+                model=model,
+                surface_points=self.config.icp.surface_points,
+                deviation_m=self.config.object_deviation_m,
+            )
+            for number, model in enumerate(models)
+        }
 
     @torch.no_grad()
     @force_float32()
@@ -134,9 +137,9 @@ class PoseEstimator:
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        prepared = self._find_object(pose_input.object).prepare()
+        known = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
-        work = partial(register, pose_input, prepared, self.config, self.refusal, watch)
+        work = partial(register, pose_input, known, self.config, watch)
         estimate = answer(pose_input, watch, work)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
@@ -148,14 +151,12 @@ class PoseEstimator:
 
     def _search_region(self, view: ViewInput) -> PoseEstimate:
         """Search the one object that is somewhere in the mask of a view, as in a box."""
-        targets = self._targets([view.object], prior_odds=PRIOR_EXPECTED, is_single=True)
+        targets = self._targets([view.object], "one")
         best = find_objects(view, targets)[0]
         return replace(best, name=view.name)
 
-    def _targets(
-        self, names: Sequence[str], *, prior_odds: float = PRIOR_PROPOSED, is_single: bool = False
-    ) -> SearchTargets:
-        """Prepare objects for a search; arguments as in :class:`SearchTargets`.
+    def _targets(self, names: Sequence[str], instances: Instances = "any number") -> SearchTargets:
+        """Prepare objects for a search, of which there are so many ``instances``.
 
         Raises:
             InputError: an unknown object, or this estimator cannot search.
@@ -165,9 +166,7 @@ class PoseEstimator:
         return SearchTargets(
             objects={name: self._find_object(name).prepare() for name in names},
             config=self.config,
-            refusal=self.refusal,
-            prior_odds=prior_odds,
-            is_single=is_single,
+            instances=instances,
         )
 
     @torch.no_grad()
@@ -369,8 +368,8 @@ class PoseEstimator:
             InputError: an unknown object, a ``first`` that is no pose, or an estimator that cannot
                 search without one.
         """
-        prepared = self._find_object(object)
-        which = prepared.model.name
+        known = self._find_object(object)
+        which = known.model.name
         if isinstance(frames, str | Path):
             raise InputError(
                 f"track: frames is {str(frames)!r}, one path; give a list of files or arrays in "
@@ -403,16 +402,11 @@ class PoseEstimator:
             """Pose the object in a frame without a pose of the frame before."""
             if isinstance(pose_input, CloudInput):
                 return self._estimate(pose_input, is_expected=False)
-            return find_objects(pose_input, self._targets([which], is_single=True))[0]
+            return find_objects(pose_input, self._targets([which], "one at most"))[0]
 
         inputs = (read(number, frame) for number, frame in enumerate(frames))
-        target = TrackedObject(
-            prepared=prepared,
-            refusal=self.refusal,
-            config=self.config,
-            search=search,
-        )
-        return iterate_in_float32(track(inputs, target, start))
+        estimates = track(inputs, known.prepare(), self.config, search, start)
+        return iterate_in_float32(estimates)
 
     def surface_of(self, object: str) -> Surface:
         """Return the sampled surface of an object, by which its poses are refined and compared.
@@ -422,8 +416,8 @@ class PoseEstimator:
         """
         return self._find_object(object).surface
 
-    def _find_object(self, name: str | None) -> PreparedObject:
-        """Find an object by its name, with its surface; None where one alone is known.
+    def _find_object(self, name: str | None) -> KnownObject:
+        """Find an object by its name; None where one alone is known.
 
         Raises:
             InputError: no object has this name, or several are known and none is named.
@@ -438,21 +432,10 @@ class PoseEstimator:
         if not isinstance(name, str):
             listing = ", ".join(map(repr, names))
             raise InputError(f"object {name!r} is no text; give the name of one: {listing}")
-        if name not in names:
+        if name not in self._known:
             nearest = suggest_name(name, names)
             raise InputError(f"object {name!r}: the {self.holder} do not know it; {nearest}")
-
-        # Its surface is sampled when it is first asked for.
-        if name not in self._prepared_objects:
-            number = names.index(name)
-            model = self.models[number]
-            surface = prepare_surface(
-                model, self.config.icp.surface_points, self.config.object_deviation_m
-            )
-            self._prepared_objects[name] = PreparedObject(
-                number=number, model=model, surface=surface
-            )
-        return self._prepared_objects[name]
+        return self._known[name]
 
 
 def _require_input(pose_input: AnyInput) -> AnyInput:

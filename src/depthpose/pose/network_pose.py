@@ -26,7 +26,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import ObjectCloud, cloud_from_depth, prepare_cloud, require_points
-from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator import NEEDS_MASK, PoseEstimator
 from depthpose.pose.geometry.grid import VoxelGrid, sample_and_voxelise
 from depthpose.pose.icp import refine_best, rotate_starts
@@ -42,9 +42,8 @@ from depthpose.pose.types import (
     Vote,
     VotingPoints,
 )
+from depthpose.pose.verify.known_object import KnownObject, has_surface, require_surface
 from depthpose.pose.verify.observability import free_motions, without_motions
-from depthpose.pose.verify.prepared_object import PreparedObject, has_surface, require_surface
-from depthpose.pose.verify.probability import PRIOR_EXPECTED, PRIOR_PROPOSED
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
@@ -64,7 +63,7 @@ class CloudToPose:
     """A cloud that is prepared for the network, and then its directions."""
 
     pose_input: AnyInput  #: from which the cloud is lifted
-    prepared: PreparedObject  #: its object
+    known: KnownObject  #: its object
     cloud: ObjectCloud  #: all points of the object
     voxels: VoxelGrid  #: with the points that the network sees and that vote, one for each voxel
     watch: Stopwatch  #: of the stages so far
@@ -116,8 +115,10 @@ class GeoPoseNet(PoseEstimator):
     """By which the weights were loaded; empty where they came from memory."""
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        # The weights have their own limits for votes; those of searches are the usual ones.
-        super().__init__(weights.models, config, RefusalConfig())
+        config = EstimateConfig() if config is None else config
+        if config.refusal is None:
+            config = replace(config, refusal=weights.refusal)
+        super().__init__(weights.models, config)
         self.weights = weights
         self.terms = weights.facts.get("terms", "")
         """Terms of the weights that bind whoever uses them; empty without any."""
@@ -214,25 +215,22 @@ class GeoPoseNet(PoseEstimator):
     ) -> CloudToPose | PoseEstimate:
         """Lift an input to the cloud and the voxels that the network takes.
 
-        For a region, or an input that is refused, the finished estimate is returned instead. The
-        point pairs of a model take half a second: a mere try of many objects does without.
+        For a region, or an input that is refused, the finished estimate is returned instead.
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        prepared = self._find_object(pose_input.object)
-        # Now, so that the time of no stage includes it.
-        _ = prepared.prepare() if is_expected else prepared.copies
+        known = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
 
         def lift() -> CloudToPose:
             """Lift it to the points of the object, and these to voxels."""
             with watch.stage("cloud"):
-                cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
+                cloud = prepare_cloud(pose_input, known.model, self.weights.cloud, self.config)
                 seed = self.config.voting.seed
                 voxels = sample_and_voxelise(cloud.cloud_m, self.weights.cloud, seed)
             return CloudToPose(
                 pose_input=pose_input,
-                prepared=prepared,
+                known=known,
                 cloud=cloud,
                 voxels=voxels,
                 watch=watch,
@@ -252,7 +250,7 @@ class GeoPoseNet(PoseEstimator):
             grids = [job.voxels for job in jobs]
             counts = [len(grid.points_m) for grid in grids]
             cloud_of_point = torch.repeat_interleave(torch.arange(len(jobs)), torch.tensor(counts))
-            numbers = torch.tensor([job.prepared.number for job in jobs])
+            numbers = torch.tensor([job.known.number for job in jobs])
             coordinates = torch.cat([grid.coordinates for grid in grids])
             points_m = [grid.points_m @ grid.grid_from_camera.mT for grid in grids]
             device = self.config.device
@@ -297,13 +295,13 @@ class GeoPoseNet(PoseEstimator):
             Refused: the votes or the evidence do not allow a pose.
         """
         config = self.config
-        prepared = job.prepared
+        known = job.known
         watch = job.watch
 
         # Propose: where the directions meet are the keypoints, to which the model's are fitted.
         with watch.stage("proposal"):
             vote = self._vote(job)
-            fits = fit_poses(vote, prepared.model, config)
+            fits = fit_poses(vote, known.model, config)
 
         # Refine; where ICP brings no point near the model, the fit of the keypoints stays.
         poses = fits.camera_from_model.double()
@@ -312,17 +310,17 @@ class GeoPoseNet(PoseEstimator):
         if config.with_icp:
             with watch.stage("icp"):
                 cloud_m = job.cloud.cloud_m.double()
-                rotated = rotate_starts(poses, prepared.surface, config.icp.starts)
-                by_icp, minima = refine_best(cloud_m, poses, prepared.surface, config.icp, rotated)
+                rotated = rotate_starts(poses, known.surface, config.icp.starts)
+                by_icp, minima = refine_best(cloud_m, poses, known.surface, config.icp, rotated)
             if float(by_icp.inlier_share) > 0:
                 refined = by_icp
                 others = minima
 
         # Where little of a part is visible, all votes may mean the wrong end of it. Poses that
         # point pairs propose compete with the one that was voted for.
-        if config.with_icp and job.is_expected and has_surface(prepared.model):
+        if config.with_icp and job.is_expected and has_surface(known.model):
             with watch.stage("proposal"):
-                proposals = propose_by_pairs(job.cloud, prepared, config.voting.seed)
+                proposals = propose_by_pairs(job.cloud, known, config.voting.seed)
             others = Rigid.cat([others, proposals])
 
         # Compare, compete, decide.
@@ -333,13 +331,12 @@ class GeoPoseNet(PoseEstimator):
         try:
             estimate = judge(
                 job.cloud,
-                prepared,
+                known,
                 refined,
                 others,
                 config,
-                self.weights.refusal,
                 watch,
-                prior_odds=PRIOR_EXPECTED if job.is_expected else PRIOR_PROPOSED,
+                is_expected=job.is_expected,
                 votes_rad=partial(self._measure_disagreement, job),
             )
         except Refused as refused:
@@ -363,8 +360,8 @@ class GeoPoseNet(PoseEstimator):
         the copy whose keypoints the directions fit best.
         """
         # The copy that fits some of the directions best.
-        keypoints_m = job.prepared.model.keypoints_m.double()
-        copies_m = (pose @ job.prepared.copies.trained).apply(keypoints_m)
+        keypoints_m = job.known.model.keypoints_m.double()
+        copies_m = (pose @ job.known.copies.trained).apply(keypoints_m)
         points_m = job.voxels.points_m.double()
         directions = normalize(job.directions.double(), dim=-1)
         step = max(1, len(points_m) // _COMPARED)
@@ -394,7 +391,7 @@ class DepthImageRegressor(PoseEstimator):
     needs_mask = True
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        super().__init__(weights.models, config, weights.refusal)
+        super().__init__(weights.models, config)
         if not isinstance(weights.network, DepthImageNet):
             raise InputError(
                 "these weights cast votes and regress no depth image; load them as GeoPoseNet"
@@ -409,7 +406,7 @@ class DepthImageRegressor(PoseEstimator):
 
     def _estimate(self, pose_input: AnyInput, *, is_expected: bool = True) -> PoseEstimate:
         """Regress the pose from a crop of the depth image, and refine it by ICP."""
-        prepared = self._find_object(pose_input.object)
+        known = self._find_object(pose_input.object)
         if not isinstance(pose_input, ViewInput):
             raise InputError(NEEDS_MASK)
         # An empty region means that nothing was detected: it is refused below for too few pixels.
@@ -418,25 +415,24 @@ class DepthImageRegressor(PoseEstimator):
         if not is_expected:
             names = ", ".join(self.objects)
             raise InputError(f"object: say which of {names}; a regressor refuses none")
+        _ = known.surface  # computed before any stage is timed
         watch = Stopwatch()
-        work = partial(self._regress, pose_input, prepared, watch)
+        work = partial(self._regress, pose_input, known, watch)
         return answer(pose_input, watch, work)
 
-    def _regress(
-        self, pose_input: ViewInput, prepared: PreparedObject, watch: Stopwatch
-    ) -> PoseEstimate:
+    def _regress(self, pose_input: ViewInput, known: KnownObject, watch: Stopwatch) -> PoseEstimate:
         """Regress the pose of one object, and refine it.
 
         Args:
             pose_input: a depth image with the mask of the object.
-            prepared: the object.
+            known: the object.
             watch: to which the times of the stages are added.
 
         Raises:
             Refused: the mask has too few readings.
         """
         config = self._network.config
-        model = prepared.model
+        model = known.model
 
         # The crop that the network sees, and the pose that it regresses.
         with watch.stage("network"):
@@ -446,7 +442,7 @@ class DepthImageRegressor(PoseEstimator):
             raise Refused("too few points", reason)
         with watch.stage("network"):
             batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
-            numbers = torch.tensor([prepared.number], device=self.config.device)
+            numbers = torch.tensor([known.number], device=self.config.device)
             poses = make_poses(self._network(batch.image, numbers), batch)
             pose = Rigid(poses.R[0].cpu().float(), poses.t_m[0].cpu().float())
         estimate = PoseEstimate(
@@ -467,8 +463,8 @@ class DepthImageRegressor(PoseEstimator):
         require_points(points_m, self._cloud)
         with watch.stage("icp"):
             icp = self.config.icp
-            rotated = rotate_starts(pose[None].double(), prepared.surface, icp.starts)
-            refined, _ = refine_best(points_m, pose, prepared.surface, icp, rotated)
+            rotated = rotate_starts(pose[None].double(), known.surface, icp.starts)
+            refined, _ = refine_best(points_m, pose, known.surface, icp, rotated)
         if float(refined.inlier_share) == 0:  # no point near the surface: nothing was refined
             return estimate
         free = free_motions(model.symmetries.continuous, refined.camera_from_model.double())

@@ -14,7 +14,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import ObjectCloud, prepare_cloud
-from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
+from depthpose.pose.config import CloudConfig, EstimateConfig
 from depthpose.pose.geometry.grid import fit_local_planes, thin_cloud
 from depthpose.pose.icp import refine_best
 from depthpose.pose.propose.point_pairs import propose_poses
@@ -23,8 +23,7 @@ from depthpose.pose.types import AnyInput, PoseEstimate, PoseFit
 from depthpose.pose.verify.decide import decide
 from depthpose.pose.verify.evidence import observe
 from depthpose.pose.verify.hypotheses import compete
-from depthpose.pose.verify.prepared_object import PreparedObject
-from depthpose.pose.verify.probability import PRIOR_EXPECTED
+from depthpose.pose.verify.known_object import KnownObject
 
 _VOTING_DIAMETERS = 0.05  # distance of the points that vote
 _PROPOSALS = 40  # poses that point pairs propose
@@ -33,24 +32,22 @@ _SMOOTHED_POINTS = 1500  # of so many, 20 neighbours give a normal that noise ha
 
 def register(
     pose_input: AnyInput,
-    prepared: PreparedObject,
+    known: KnownObject,
     config: EstimateConfig,
-    refusal: RefusalConfig,
     watch: Stopwatch,
     *,
     proposals: Rigid | None = None,
-    prior_odds: float = PRIOR_EXPECTED,
+    is_expected: bool = True,
 ) -> PoseEstimate:
     """Register a model to the points of an object: of a mask, or where a search proposed it.
 
     Args:
         pose_input: the points.
-        prepared: the object.
-        config: of ICP, and of what a real object is off from its model.
-        refusal: when the estimate is withheld.
+        known: the object.
+        config: of ICP and limits.
         watch: to which the times of the stages are added.
         proposals: poses of a search; None: point pairs of the points propose.
-        prior_odds: of the best pose being right, before its evidence is seen.
+        is_expected: whether a mask or a detector's box says that the object is there.
 
     Raises:
         InputError: mask and depth differ in size.
@@ -58,17 +55,17 @@ def register(
     """
     # The usable points of the object.
     with watch.stage("cloud"):
-        cloud = prepare_cloud(pose_input, prepared.model, CloudConfig(), config)
+        cloud = prepare_cloud(pose_input, known.model, CloudConfig(), config)
 
     # Propose.
     with watch.stage("proposal"):
         if proposals is None:
-            proposals = propose_by_pairs(cloud, prepared, config.voting.seed)
+            proposals = propose_by_pairs(cloud, known, config.voting.seed)
 
     # Refine.
     with watch.stage("icp"):
         cloud_m = cloud.cloud_m.double()
-        refined, others = refine_best(cloud_m, proposals, prepared.surface, config.icp)
+        refined, others = refine_best(cloud_m, proposals, known.surface, config.icp)
     if float(refined.inlier_share) == 0:
         raise Refused(
             "no pose found",
@@ -76,42 +73,40 @@ def register(
         )
 
     # Compare, compete, decide.
-    return judge(cloud, prepared, refined, others, config, refusal, watch, prior_odds=prior_odds)
+    return judge(cloud, known, refined, others, config, watch, is_expected=is_expected)
 
 
-def propose_by_pairs(cloud: ObjectCloud, prepared: PreparedObject, seed: int) -> Rigid:
+def propose_by_pairs(cloud: ObjectCloud, known: KnownObject, seed: int) -> Rigid:
     """Propose poses by the point pairs of a cloud."""
     dense_m = take_evenly(cloud.cloud_m.double(), _SMOOTHED_POINTS)
-    step_m = _VOTING_DIAMETERS * prepared.surface.diameter_m
+    step_m = _VOTING_DIAMETERS * known.surface.diameter_m
     voting_m = dense_m[thin_cloud(dense_m, torch.zeros_like(dense_m), step_m)]
     normals, _ = fit_local_planes(dense_m, voting_m)
     generator = torch.Generator().manual_seed(seed)
-    return propose_poses(voting_m, normals, prepared.pairs, _PROPOSALS, generator)
+    return propose_poses(voting_m, normals, known.pairs, _PROPOSALS, generator)
 
 
 def judge(
     cloud: ObjectCloud,
-    prepared: PreparedObject,
+    known: KnownObject,
     refined: PoseFit,
     others: Rigid,
     config: EstimateConfig,
-    refusal: RefusalConfig,
     watch: Stopwatch,
     *,
-    prior_odds: float,
+    is_expected: bool,
     votes_rad: Callable[[Rigid], float] | None = None,
 ) -> PoseEstimate:
     """Compare a refined pose with the depth image and with its competitors, and decide.
 
     Args:
         cloud: points of the object.
-        prepared: the object.
+        known: the object.
         refined: the best pose.
         others: at which refinement ended too, or that were proposed.
-        config: settings of the estimate; without ICP competing poses stay where they are.
-        refusal: when it is withheld.
+        config: of limits, and of ICP, without which competing poses stay where they are.
         watch: of the stages before, to which this one's are added.
-        prior_odds: of the best pose being right, before its evidence is seen.
+        is_expected: whether a mask or a detector's box says that the object is there.
         votes_rad: angle between a network's directions and a pose, as :func:`compete` takes it.
 
     Raises:
@@ -119,15 +114,13 @@ def judge(
     """
     # The best pose against its near-symmetric copies, look-alikes and other local minima.
     with watch.stage("evidence"):
-        observation = observe(
-            cloud.cloud_m, cloud.view, prepared.surface, is_masked=cloud.is_masked
-        )
+        observation = observe(cloud.cloud_m, cloud.view, known.surface, is_masked=cloud.is_masked)
         has_color = cloud.view is not None and cloud.view.color is not None
         competition = compete(
             cloud.cloud_m.double(),
             refined,
             others,
-            prepared,
+            known,
             observation,
             config,
             cloud.view if has_color else None,
@@ -137,11 +130,10 @@ def judge(
     with watch.stage("decision"):
         estimate = decide(
             cloud,
-            prepared,
+            known,
             competition,
             observation,
-            refusal=refusal,
             config=config,
-            prior_odds=prior_odds,
+            is_expected=is_expected,
         )
     return replace(estimate, seconds=watch.seconds)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from depthpose.core.devices import force_float32
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
-from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator import PoseEstimator
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.mesh import (
@@ -21,7 +21,7 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate
-from depthpose.pose.verify.prepared_object import require_surface
+from depthpose.pose.verify.known_object import require_surface
 
 
 class Registration(PoseEstimator):
@@ -38,7 +38,6 @@ class Registration(PoseEstimator):
     Args:
         models: the objects.
         config: ICP, limits; the seed is that of voting.
-        refusal: when an answer is withheld; None: by the usual limits.
 
     Raises:
         InputError: no model, two of one name, or one of few points without faces.
@@ -47,13 +46,8 @@ class Registration(PoseEstimator):
     holder = "models"
     expects_all = True
 
-    def __init__(
-        self,
-        models: Sequence[ObjectModel],
-        config: EstimateConfig | None = None,
-        refusal: RefusalConfig | None = None,
-    ) -> None:
-        super().__init__(models, config, refusal or RefusalConfig())
+    def __init__(self, models: Sequence[ObjectModel], config: EstimateConfig | None = None) -> None:
+        super().__init__(models, config)
         if not models:
             raise InputError(
                 "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"

@@ -6,13 +6,12 @@ same readings are one place; there the object is estimated from the readings tha
 explains. Places that explain the same readings compete.
 """
 
-import math
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -22,7 +21,7 @@ from depthpose.core.devices import map_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import cloud_from_depth, require_same_size, why_nothing_seen
-from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.footprint import crop_to_region, explained_frame_mask, why_background_excludes
 from depthpose.pose.frame import Frame, prepare_frame
 from depthpose.pose.icp import refine_roughly
@@ -39,12 +38,10 @@ from depthpose.pose.verify.decide import (
     with_status,
 )
 from depthpose.pose.verify.evidence import compare, observe
-from depthpose.pose.verify.prepared_object import PreparedObject
+from depthpose.pose.verify.known_object import KnownObject
 from depthpose.pose.verify.probability import (
     LEAST_POSSIBLE,
-    PRIOR_MANY,
-    PRIOR_PROPOSED,
-    log_likelihood_ratio,
+    log_odds_right,
     probability_of_instances,
     probability_right,
 )
@@ -65,19 +62,28 @@ _SAME_PLACE = 0.5
 """Poses that explain so much of the same readings are at one place; two objects compete there."""
 
 
+Instances = Literal["one", "one at most", "any number"]  #: see ``SearchTargets.instances``
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SearchTargets:
     """What is looked for."""
 
-    objects: Mapping[str, PreparedObject]  #: by their names
-    config: EstimateConfig  #: of ICP, and of what a real object is off from its model
-    refusal: RefusalConfig  #: when a pose is withheld
-    prior_odds: float = PRIOR_PROPOSED  #: of the best pose at a place being right
-    #: at most one instance of each object is expected, as in a detector's box or a frame of a
-    #: track. Then (1) one round searches the image, (2) a place is left out that lies mostly beside
-    #: the mask, (3) places of one object are weighed without the case that there are many of it
-    #: (prior odds 0 in place of ``PRIOR_MANY``), and (4) no order of picking is given.
-    is_single: bool = False
+    objects: Mapping[str, KnownObject]  #: by their names
+    config: EstimateConfig  #: of ICP and limits
+    #: how many of each object there are: ``one`` in a detector's box, ``one at most`` in a frame of
+    #: a track, ``any number`` in another image.
+    instances: Instances = "any number"
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether each object is expected to be there."""
+        return self.instances == "one"
+
+    @property
+    def is_single(self) -> bool:
+        """Whether each object is there once at most."""
+        return self.instances != "any number"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -267,7 +273,7 @@ def _refine(
     hopeless: list[_Miss] = []
     refined = map_in_threads(refine, places, torch.get_num_threads())
     for place, (pose, evidence) in zip(places, refined, strict=True):
-        probability = probability_right(evidence, targets.prior_odds)
+        probability = probability_right(evidence, is_expected=targets.is_expected)
         if probability < LEAST_POSSIBLE:
             reason = explain_doubt(evidence, probability, is_masked=False)
             hopeless.append(_miss_at(place, evidence, reason, targets))
@@ -321,10 +327,9 @@ def _judge(
             cloud,
             targets.objects[leader.object],
             targets.config,
-            targets.refusal,
             watch,
             proposals=Rigid.stack([place.pose for place in group]),
-            prior_odds=targets.prior_odds,
+            is_expected=targets.is_expected,
         )
         return answer(cloud, watch, work)
 
@@ -347,7 +352,7 @@ def _judge(
                 pose=pose,
                 explained=explained_frame_mask(frame, pose, surface),
                 estimate=estimate,
-                log_odds=math.log(targets.prior_odds) + log_likelihood_ratio(evidence),
+                log_odds=log_odds_right(evidence, is_expected=targets.is_expected),
             )
         )
     return judged, misses
@@ -379,13 +384,12 @@ def _weigh_instances(
     for name in dict.fromkeys(place.object for place in accepted):
         places = [place for place in accepted if place.object == name]
         log_odds = torch.tensor([place.log_odds for place in places], dtype=torch.float64)
-        prior_many = 0.0 if targets.is_single else PRIOR_MANY
-        probabilities = probability_of_instances(log_odds, prior_many)
+        probabilities = probability_of_instances(log_odds, is_single=targets.is_single)
         shares = probabilities / log_odds.sigmoid()  # of the probability that each has by itself
         for place, share in zip(places, shares.tolist(), strict=True):
             estimate = with_share(place.estimate, share)
             assert estimate.certainty is not None, "judged poses have evidence"
-            if estimate.certainty >= targets.refusal.min_probability:
+            if estimate.certainty >= targets.config.limits.min_probability:
                 remaining.append(replace(place, estimate=estimate))
             else:
                 reason = (

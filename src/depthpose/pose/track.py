@@ -33,8 +33,8 @@ from depthpose.pose.types import (
 )
 from depthpose.pose.verify.decide import require_observable, require_right, with_status
 from depthpose.pose.verify.evidence import compare, observe
+from depthpose.pose.verify.known_object import KnownObject
 from depthpose.pose.verify.observability import free_motions, without_motions
-from depthpose.pose.verify.prepared_object import PreparedObject
 from depthpose.pose.verify.probability import (
     PRIOR_EXPECTED,
     log_likelihood_ratio,
@@ -109,16 +109,6 @@ def _lift_square_about(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TrackedObject:
-    """The object that is followed, and how it is searched for."""
-
-    prepared: PreparedObject  #: the object
-    refusal: RefusalConfig  #: when a pose is refused
-    config: EstimateConfig  #: settings of the estimates
-    search: Callable[[AnyInput], PoseEstimate]  #: poses the object where no last pose is known
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _FrameMotion:
     """How an object moved between two frames: rotated about its own origin, and shifted."""
 
@@ -146,14 +136,20 @@ class _Track:
 
 
 def track(
-    frames: Iterable[AnyInput | PoseEstimate], target: TrackedObject, first: Rigid | None = None
+    frames: Iterable[AnyInput | PoseEstimate],
+    known: KnownObject,
+    config: EstimateConfig,
+    search: Callable[[AnyInput], PoseEstimate],
+    first: Rigid | None = None,
 ) -> Iterator[PoseEstimate]:
     """Estimate the pose of one object in frame after frame, each from that of the frame before.
 
     Args:
         frames: views or clouds. In place of a frame that cannot be read, an estimate that says so:
             it is yielded unchanged, and the next frame is estimated from the pose before.
-        target: the object.
+        known: the object.
+        config: of ICP and limits.
+        search: poses the object in a frame where it is not followed.
         first: its rough pose ``camera_from_model`` in the first frame; None: it is searched.
 
     Yields:
@@ -168,7 +164,7 @@ def track(
         if isinstance(pose_input, PoseEstimate):
             yield pose_input
             continue
-        work = partial(_follow_or_search, pose_input, current, target)
+        work = partial(_follow_or_search, pose_input, current, known, config, search)
         outcome = unreadable_on_error(pose_input, work)
         if isinstance(outcome, PoseEstimate):
             yield outcome
@@ -184,7 +180,11 @@ def track(
 
 
 def _follow_or_search(
-    pose_input: AnyInput, current: _Track | None, target: TrackedObject
+    pose_input: AnyInput,
+    current: _Track | None,
+    known: KnownObject,
+    config: EstimateConfig,
+    search: Callable[[AnyInput], PoseEstimate],
 ) -> tuple[PoseEstimate, _Track | None]:
     """Follow the object into a frame, or else search it there.
 
@@ -202,14 +202,14 @@ def _follow_or_search(
     if current is not None:
         try:
             with watch.stage("tracking"):
-                estimate, following = _follow(pose_input, current, target)
+                estimate, following = _follow(pose_input, current, known, config)
         except Refused:  # searched below
             pass
         else:
             return replace(estimate, name=pose_input.name, seconds=watch.seconds), following
 
     # Searched: not known from the frame before, or not seen where it was.
-    searched = target.search(pose_input)
+    searched = search(pose_input)
     seconds = {**watch.seconds, **searched.seconds}
     pose = searched.camera_from_model
     tracking = "lost" if pose is None else "found"
@@ -227,7 +227,7 @@ def _follow_or_search(
 
 
 def _follow(
-    pose_input: AnyInput, current: _Track, target: TrackedObject
+    pose_input: AnyInput, current: _Track, known: KnownObject, config: EstimateConfig
 ) -> tuple[PoseEstimate, _Track]:
     """Refine the last pose and the predicted one, and weigh the better one by the evidence.
 
@@ -238,7 +238,7 @@ def _follow(
         Refused: the object is not followed.
     """
     # Where it may be: at its last pose, or going on as it moved last.
-    surface = target.prepared.surface
+    surface = known.surface
     starts = [current.pose]
     if current.motion is not None:
         starts.insert(0, current.motion.move(current.pose))
@@ -254,7 +254,7 @@ def _follow(
         raise Refused("too few points", reason)
 
     # Refined, and the points that lie on it then.
-    refined, _ = refine_best(cloud_m, poses, surface, target.config.icp)
+    refined, _ = refine_best(cloud_m, poses, surface, config.icp)
     pose = refined.camera_from_model.double()
     object_m = scene_m[_mark_near(scene_m, pose[None], surface, NEAR) & ~is_support]
     if len(object_m) < _LEAST_POINTS:
@@ -262,14 +262,14 @@ def _follow(
         raise Refused("too few points", reason)
 
     # Is the pose right, and does what is seen of the object determine it?
-    weighed = _weigh_pose(pose_input, object_m, pose, current.log_odds, target)
-    free = free_motions(target.prepared.model.symmetries.continuous, pose)
-    require_observable(object_m, target.prepared, pose, free, target.refusal.min_observability)
+    weighed = _weigh_pose(pose_input, object_m, pose, current.log_odds, surface, config.limits)
+    free = free_motions(known.model.symmetries.continuous, pose)
+    require_observable(object_m, known, pose, free, config.limits)
 
     # The estimate, and the track that the next frame begins with.
     estimate = PoseEstimate(
         name="",
-        object=target.prepared.model.name,
+        object=known.model.name,
         status="ok",
         camera_from_model=refined.camera_from_model.float(),
         covariance=without_motions(refined.covariance, free).float(),
@@ -281,7 +281,7 @@ def _follow(
         tracking="tracked",
     )
     estimate = _carry_copies(estimate, pose, current.first)
-    estimate = with_status(estimate, target.config.min_certainty)
+    estimate = with_status(estimate, config.min_certainty)
     motion = _FrameMotion.between(current.pose, pose)
     following = replace(current, pose=pose, motion=motion, log_odds=weighed.log_odds)
     return estimate, following
@@ -300,7 +300,8 @@ def _weigh_pose(
     object_m: Float64[Tensor, "n 3"],
     pose: Rigid,
     log_odds: float,
-    target: TrackedObject,
+    surface: Surface,
+    limits: RefusalConfig,
 ) -> _WeighedPose:
     """Weigh a pose by the evidence of its frame, alone and together with the frames before.
 
@@ -309,7 +310,8 @@ def _weigh_pose(
         object_m: points that lie on the object at the pose.
         pose: ``camera_from_model``.
         log_odds: that the track is right, by the frames before.
-        target: the object.
+        surface: of the model.
+        limits: the least probability.
 
     Raises:
         Refused: the pose is doubtful, by this frame or by all.
@@ -318,18 +320,18 @@ def _weigh_pose(
     observation = observe(
         object_m,
         pose_input if isinstance(pose_input, ViewInput) else pose_input.view,
-        target.prepared.surface,
+        surface,
         is_masked=False,
     )
-    evidence = compare(observation, pose, target.prepared.surface)
-    probability = probability_right(evidence, PRIOR_EXPECTED)
-    require_right(evidence, probability, target.refusal, is_masked=False)
+    evidence = compare(observation, pose, surface)
+    probability = probability_right(evidence, is_expected=True)
+    require_right(evidence, probability, limits, is_masked=False)
 
     # Together with the frames before.
     log_odds += _NEW_EVIDENCE * log_likelihood_ratio(evidence)
     log_odds = min(max(log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
     certainty = 1 / (1 + math.exp(-log_odds))
-    if certainty < target.refusal.min_probability:
+    if certainty < limits.min_probability:
         reason = (
             f"together with the frames before it the pose is right with a probability of "
             f"{certainty:.0%}, though by this frame alone with {probability:.0%}"

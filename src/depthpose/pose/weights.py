@@ -60,7 +60,7 @@ class PoseWeights:
     network: AnyNetwork  #: in eval mode where it was read
     models: tuple[ObjectModel, ...]  #: the objects; class k of the network is ``models[k]``
     cloud: CloudConfig  #: by which the clouds were lifted that the network was trained on
-    refusal: RefusalConfig  #: when its estimates are withheld
+    refusal: RefusalConfig  #: when its poses are withheld, unless the estimator's config says
     facts: Mapping[str, str]  #: the card in short: ``trained_on``, ``licence``, ``terms`` and more
 
     def __post_init__(self) -> None:

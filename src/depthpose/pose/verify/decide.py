@@ -18,8 +18,8 @@ from depthpose.pose.verify.copies import describe_difference
 from depthpose.pose.verify.evidence import Observation
 from depthpose.pose.verify.hypotheses import Competition, Hypothesis
 from depthpose.pose.verify.identity import identify
+from depthpose.pose.verify.known_object import KnownObject
 from depthpose.pose.verify.observability import free_motions, observability, without_motions
-from depthpose.pose.verify.prepared_object import PreparedObject
 from depthpose.pose.verify.probability import (
     LEAST_AREA,
     WRONG_RMS,
@@ -40,31 +40,29 @@ LEAST_SHARE = 0.8
 
 def decide(
     cloud: ObjectCloud,
-    prepared: PreparedObject,
+    known: KnownObject,
     competition: Competition,
     observation: Observation,
     *,
-    refusal: RefusalConfig,
     config: EstimateConfig,
-    prior_odds: float,
+    is_expected: bool,
 ) -> PoseEstimate:
     """Return the likeliest of competing poses as the estimate.
 
     Args:
         cloud: points of the object.
-        prepared: the object.
+        known: the object.
         competition: of its poses.
         observation: that they were compared with.
-        refusal: limits.
-        config: settings of the estimate; without ICP size and mirror image are not tested.
-        prior_odds: of the best pose being right, before its evidence is seen.
+        config: of limits; without ICP size and mirror image are not tested.
+        is_expected: whether a mask or a detector's box says that the object is there.
 
     Raises:
         Refused: it is not observable, doubtful, or of another object.
     """
-    model = prepared.model
+    model = known.model
     best = competition.best
-    probability = probability_right(best.evidence, prior_odds)
+    probability = probability_right(best.evidence, is_expected=is_expected)
     free = free_motions(model.symmetries.continuous, best.pose)
 
     # A cloud, other than a depth image, may be in another frame than the camera's.
@@ -76,9 +74,9 @@ def decide(
         "evidence": best.evidence,
     }
     try:
-        require_observable(cloud.cloud_m, prepared, best.pose, free, refusal.min_observability)
-        require_right(best.evidence, probability, refusal, is_masked=observation.is_masked)
-        identity = _require_identity(cloud, prepared, best, observation, config, refusal)
+        require_observable(cloud.cloud_m, known, best.pose, free, config.limits)
+        require_right(best.evidence, probability, config.limits, is_masked=observation.is_masked)
+        identity = _require_identity(cloud, known, best, observation, config)
     except Refused as refused:  # all but the pose, so that nobody takes it for an estimate
         reason = refused.reason + (hint if refused.status == "doubtful" else "")
         measured = {**measured, **refused.measured}
@@ -94,7 +92,7 @@ def decide(
         certainty=probability * competition.group_share,
         copy_certainty=probability * competition.best_share,
         identity=identity,
-        alternatives=_list_alternatives(competition, probability, prepared),
+        alternatives=_list_alternatives(competition, probability, known),
         **measured,
     )
     estimate = with_status(estimate, config.min_certainty)
@@ -105,10 +103,10 @@ def decide(
 
 def require_observable(
     cloud_m: Float[Tensor, "n 3"],
-    prepared: PreparedObject,
+    known: KnownObject,
     pose: Rigid,
     free: Float[Tensor, "k 6"],
-    least: float,
+    limits: RefusalConfig,
 ) -> None:
     """Raise :class:`Refused` where a view leaves a motion beside the free ones undetermined.
 
@@ -117,20 +115,20 @@ def require_observable(
 
     Args:
         cloud_m: points of the object, in the camera frame.
-        prepared: the object.
+        known: the object.
         pose: of it.
         free: motions of declared symmetries, by
             :func:`~depthpose.pose.verify.observability.free_motions`.
-        least: share of its length by which every other motion must move the visible surface.
+        limits: the least share by which every other motion must move the visible surface.
     """
-    near_axis = prepared.copies.near_axis
+    near_axis = known.copies.near_axis
     if near_axis is not None:
         free = torch.cat([free, free_motions((near_axis,), pose)])
-    observed = observability(cloud_m, pose, prepared.surface, free)
+    observed = observability(cloud_m, pose, known.surface, free)
     if observed is None:
         raise Refused("doubtful", "too few points lie on the posed surface to determine a pose")
     observable, weakest = observed
-    if observable >= least:
+    if observable >= limits.min_observability:
         return
     motion = "rotation" if float(weakest[:3].norm()) > math.sqrt(0.5) else "shift"
     raise Refused(
@@ -142,44 +140,44 @@ def require_observable(
 
 
 def require_right(
-    evidence: Evidence, probability: float, refusal: RefusalConfig, *, is_masked: bool
+    evidence: Evidence, probability: float, limits: RefusalConfig, *, is_masked: bool
 ) -> None:
     """Raise :class:`Refused` where a pose is right with too small a probability.
 
     Args:
         evidence: of the pose.
         probability: of its being right.
-        refusal: the least probability.
+        limits: the least probability.
         is_masked: whether all points were taken for the object's, as a mask gives them.
     """
-    if probability < refusal.min_probability:
+    if probability < limits.min_probability:
         raise Refused("doubtful", explain_doubt(evidence, probability, is_masked=is_masked))
 
 
 def _require_identity(
     cloud: ObjectCloud,
-    prepared: PreparedObject,
+    known: KnownObject,
     best: Hypothesis,
     observation: Observation,
     config: EstimateConfig,
-    refusal: RefusalConfig,
 ) -> Identity | None:
     """Raise :class:`Refused` where another size or the mirror image of the object fits better.
 
     Returns:
         Whether it is this object; None where that is not tested.
     """
-    if not config.with_icp or refusal.max_size_error >= 1:
+    max_size_error = config.limits.max_size_error
+    if not config.with_icp or max_size_error >= 1:
         return None
     identity = identify(
         cloud.cloud_m,
         best.pose,
-        prepared.model.name,
-        prepared.surface,
-        prepared.copies.mirror,
+        known.model.name,
+        known.surface,
+        known.copies.mirror,
         best.evidence,
         observation.focal_px,
-        refusal.max_size_error,
+        max_size_error,
     )
     if identity.status == "contradicted":
         raise Refused("doubtful", identity.reason, identity=identity)
@@ -187,7 +185,7 @@ def _require_identity(
 
 
 def _list_alternatives(
-    competition: Competition, probability: float, prepared: PreparedObject
+    competition: Competition, probability: float, known: KnownObject
 ) -> tuple[Alternative, ...]:
     """List the poses that may be right in place of the best, the likeliest first."""
     competitors = [(h, share, True) for h, share in competition.copies]
@@ -197,7 +195,7 @@ def _list_alternatives(
         Alternative(
             camera_from_model=hypothesis.pose.float(),
             probability=probability * share,
-            difference=describe_difference(hypothesis.pose, competition.best.pose, prepared.copies),
+            difference=describe_difference(hypothesis.pose, competition.best.pose, known.copies),
             is_copy=is_copy,
         )
         for hypothesis, share, is_copy in competitors

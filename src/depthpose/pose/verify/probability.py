@@ -61,9 +61,9 @@ PRIOR_EXPECTED = 2.0
 """Odds of the best pose being right before its evidence is seen, where a mask or a detector's box
 says that the object is there. Of views that do show it the fit gives 5; some masks show another
 thing."""
-PRIOR_PROPOSED = 0.02
-"""The same where a search proposed the pose: votes of a whole image refine to some fifty poses for
-each object that is there."""
+PRIOR_UNEXPECTED = 0.02
+"""The same where nothing says so: votes of a whole image refine to some fifty poses for each object
+that is there."""
 PRIOR_MANY = 0.1
 """Odds of an image holding any number of instances of an object, rather than one at most."""
 WRONG_RMS = 1.2
@@ -82,16 +82,25 @@ LEAST_AREA = 1.0
 """Independent patches: of less nothing is said."""
 
 
-def probability_right(evidence: Evidence, prior_odds: float) -> float:
+def probability_right(evidence: Evidence, *, is_expected: bool) -> float:
     """Compute the probability that a pose is right, and not merely the best of the wrong ones.
 
     Right is a pose up to near-symmetry. The probability is 0 where less than two thirds of what was
     observed supports the pose, and where the surface goes on across much of its silhouette.
+
+    Args:
+        evidence: of the pose.
+        is_expected: whether a mask or a detector's box says that the object is there.
     """
     if evidence.agreement < LEAST_AGREEMENT or is_on_larger(evidence):
         return 0.0
-    log_odds = math.log(prior_odds) + log_likelihood_ratio(evidence)
-    return 1 / (1 + math.exp(-log_odds))
+    return 1 / (1 + math.exp(-log_odds_right(evidence, is_expected=is_expected)))
+
+
+def log_odds_right(evidence: Evidence, *, is_expected: bool) -> float:
+    """Compute the log odds of a pose being right; arguments as of :func:`probability_right`."""
+    prior_odds = PRIOR_EXPECTED if is_expected else PRIOR_UNEXPECTED
+    return math.log(prior_odds) + log_likelihood_ratio(evidence)
 
 
 def is_on_larger(evidence: Evidence) -> bool:
@@ -161,17 +170,18 @@ def _log_likelihood_of_residuals(rms: float) -> float:
 
 
 def probability_of_instances(
-    log_odds: Float64[Tensor, " n"], prior_many: float
+    log_odds: Float64[Tensor, " n"], *, is_single: bool
 ) -> Float64[Tensor, " n"]:
-    """Compute the probability of each place of one object, of which there is one or any number.
+    """Compute the probability of each place of one object, by those of the others.
 
     A table holds one of each object, a bin holds many: so a second place needs more evidence than
     the first, and where several have it further ones need no more.
 
     Args:
         log_odds: of each place being right, by itself.
-        prior_many: odds of any number of instances, and not one at most; 0 in a detector's box.
+        is_single: whether there is one instance at most, as in a detector's box, and no bin.
     """
+    prior_many = 0.0 if is_single else PRIOR_MANY
     by_itself = log_odds.sigmoid()
     log_weights_none_or_one = torch.cat([log_odds.new_zeros(1), log_odds])
     # Of any number of instances every choice of places is possible.

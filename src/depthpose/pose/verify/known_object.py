@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from depthpose.core.errors import InputError
-from depthpose.pose.geometry.surface import Surface
+from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.propose.point_pairs import PairTable, prepare_pairs
 from depthpose.pose.types import ObjectModel
 from depthpose.pose.verify.copies import SymmetricCopies, find_copies
@@ -13,19 +13,26 @@ _LEAST_POINTS = 500  # a model without faces and with fewer points has no surfac
 
 
 @dataclass(kw_only=True, eq=False)
-class PreparedObject:
-    """A known object, with what is computed once of its model, at the first use."""
+class KnownObject:
+    """A known object; each part of what its model gives is computed at its first use, and kept."""
 
     number: int  #: among the models of an estimator
     model: ObjectModel  #: the object
-    surface: Surface  #: of the model
+    surface_points: int = 10_000  #: samples of its surface
+    deviation_m: float | None = None  #: of the real surface, as :func:`prepare_surface` takes it
 
-    def prepare(self) -> "PreparedObject":
-        """Compute what the model allows now, so that the time of no input includes it."""
+    def prepare(self) -> "KnownObject":
+        """Compute all parts now, in some seconds, so that the time of no input includes it."""
+        _ = self.surface
         _ = self.copies
         if has_surface(self.model):
             _ = self.pairs
         return self
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The surface of the model."""
+        return prepare_surface(self.model, self.surface_points, self.deviation_m)
 
     @cached_property
     def copies(self) -> SymmetricCopies:
