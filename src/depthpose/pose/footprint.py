@@ -1,4 +1,4 @@
-"""Which readings of an image a posed surface explains, and whether a background excludes it."""
+"""Which readings of an image a posed surface explains, and its share in the background."""
 
 import math
 from dataclasses import replace
@@ -17,8 +17,6 @@ from depthpose.pose.types import KnownBackground, ViewInput
 
 _REGION_MARGIN = 0.5
 """Margin about a region in which planes and neighbours are examined, over its larger side."""
-_MOST_SUNK = 0.05
-"""Largest share of the surface that may lie in a bin, table or wall: right poses err by less."""
 
 
 def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
@@ -105,8 +103,11 @@ def _crop_view(view: ViewInput, window: Window) -> ViewInput:
     )
 
 
-def why_background_excludes(frame: Frame, pose: Rigid, surface: Surface) -> str:
-    """Explain why the background of an image excludes a pose; an empty text where it does not.
+def share_in_background(frame: Frame, pose: Rigid, surface: Surface) -> float:
+    """Measure the share of a posed surface that would lie in the background, 0..1.
+
+    Of several backgrounds it is the largest share in one. Planes of which the object may have one
+    as a side are none.
 
     Args:
         frame: of the searched part of the image, whose backgrounds count.
@@ -114,10 +115,9 @@ def why_background_excludes(frame: Frame, pose: Rigid, surface: Surface) -> str:
         surface: of the model.
     """
     points_m = pose.apply(surface.points_m)
-    for background in frame.backgrounds:
-        if background.diameter_m < surface.diameter_m:  # the plane may be a side of the object
-            continue
-        share = share_behind(frame, background, points_m, surface.near_m)
-        if share > _MOST_SUNK:
-            return f"{share:.0%} of it would lie in the bin, table or wall before which it is seen"
-    return ""
+    shares = (
+        share_behind(frame, background, points_m, surface.near_m)
+        for background in frame.backgrounds
+        if background.diameter_m >= surface.diameter_m
+    )
+    return max(shares, default=0.0)
