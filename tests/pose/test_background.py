@@ -19,9 +19,9 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.background import PosedBin, add_background
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
-from depthpose.pose.footprint import share_in_background
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.geometry.surface import prepare_surface
+from depthpose.pose.inliers import share_in_background
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m

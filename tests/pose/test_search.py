@@ -23,9 +23,9 @@ from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose import search
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.footprint import explained_frame_mask, share_in_background
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.geometry.surface import prepare_surface
+from depthpose.pose.inliers import frame_inliers, share_in_background
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
@@ -544,7 +544,7 @@ def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registratio
     candidates = [
         search.Candidate(
             object="bracket", surface=surface, pose=pose,
-            inliers=explained_frame_mask(frame, pose, surface),
+            inliers=frame_inliers(frame, pose, surface),
         )
         for pose in (wrong, coarse)
     ]  # fmt: skip

@@ -31,10 +31,10 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import cloud_from_depth, require_same_size, why_nothing_seen
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.footprint import crop_to_region, explained_frame_mask, share_in_background
-from depthpose.pose.frame import Frame, prepare_frame
+from depthpose.pose.frame import Frame, crop_to_region, prepare_frame
 from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.icp import refine_roughly
+from depthpose.pose.inliers import frame_inliers, share_in_background
 from depthpose.pose.picking import rank_picks
 from depthpose.pose.pipeline import register
 from depthpose.pose.propose.image import propose_in_frame
@@ -237,7 +237,7 @@ def _propose(
         if number >= _MOST_PROPOSALS and places_of_object[name] >= _LEAST_PLACES:
             continue
         surface = targets.objects[name].surface
-        inliers = explained_frame_mask(frame, pose, surface)
+        inliers = frame_inliers(frame, pose, surface)
         candidate = Candidate(object=name, surface=surface, pose=pose, inliers=inliers)
         is_claimed = any(candidate.overlap(other) > _MOST_OVERLAP for other in claimed)
         if is_claimed or len(candidate.pixels) * frame.step**2 < _LEAST_PIXELS:
@@ -288,7 +288,7 @@ def _move(
     return replace(
         candidate,
         pose=pose,
-        inliers=explained_frame_mask(frame, pose, candidate.surface),
+        inliers=frame_inliers(frame, pose, candidate.surface),
         evidence=evidence,
         log_odds=math.log(targets.prior_odds) + log_likelihood_ratio(evidence),
     )
@@ -423,7 +423,8 @@ def _weigh_objects(maxima: Sequence[Candidate], candidates: Sequence[Candidate])
     ranked = _rank(candidates)
     weighed: list[Candidate] = []
     for candidate in _remaining(maxima):
-        # The likeliest of each other object. What is likelier than a maximum is of another place.
+        # The likeliest of each other object. What is likelier than a maximum and suppressed is of
+        # another place.
         rivals = {candidate.object: candidate}
         for other in ranked[ranked.index(candidate) + 1 :]:
             if candidate.overlap(other) > _SAME_PLACE:

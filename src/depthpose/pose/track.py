@@ -19,9 +19,9 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import cloud_from_depth, require_same_size
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.geometry.surface import NEAR, Surface
 from depthpose.pose.icp import refine_best
+from depthpose.pose.planes import is_on_plane, largest_plane
 from depthpose.pose.refusals import Refused, unreadable_on_error
 from depthpose.pose.types import (
     Alternative,
