@@ -1,4 +1,4 @@
-"""Planes among the readings of a depth sensor; the wide ones are tables and walls behind objects."""
+"""Planes in the readings of a depth sensor; the wide ones are tables and walls behind objects."""
 
 import math
 from dataclasses import dataclass
