@@ -550,10 +550,15 @@ def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registratio
     ]  # fmt: skip
     targets = replace(TARGETS, objects={"bracket": prepared})
     refined = search._refine(candidates, frame, view, targets)
-    assert len(refined) == len(candidates)
+    assert not any(candidate.rejected for candidate in refined)
     leader = search._group(refined)[0][0]
     assert float((leader.pose.t_m - truth.t_m).norm()) < 0.001, "refined"
     assert float(geodesic_rad(leader.pose.R.float(), truth.R.float())) < 0.1
+
+    hopeless = search._refine(candidates, frame, view, replace(targets, prior_odds=1e-9))
+    for candidate, other in zip(hopeless, refined, strict=True):
+        assert candidate.rejected
+        assert torch.equal(candidate.pose.t_m, other.pose.t_m), "it is a miss where it was compared"
 
 
 def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -102,7 +102,7 @@ class Candidate:
     surface: Surface  #: of the object
     pose: Rigid  #: ``camera_from_model``
     inliers: Bool[Tensor, "h w"]  #: readings of the frame that the pose explains
-    evidence: Evidence | None = None  #: of its last comparison with the image; None: of none
+    evidence: Evidence | None = None  #: of the pose; None: it was not compared with the image
     log_odds: float = -math.inf  #: of the pose being right, by its evidence
     estimate: PoseEstimate | None = None  #: of the object, where it was registered
     rejected: str = ""  #: why the object is not there, in a sentence; empty while it may be
@@ -264,11 +264,12 @@ def _refine(
         pose = refine_roughly(cloud_m, candidate.pose[None], surface, end_diameters)[0]
         observation = observe(cloud_m, view, surface, is_masked=False)
         evidence = compare(observation, pose, surface)
+        refined = _move(candidate, pose, evidence, frame, targets)
         probability = probability_right(evidence, targets.prior_odds)
         if probability < LEAST_POSSIBLE:
             reason = explain_doubt(evidence, probability, is_masked=False)
-            return replace(candidate, evidence=evidence, rejected=reason)
-        return _move(candidate, pose, evidence, frame, targets)
+            return replace(refined, rejected=reason)
+        return refined
 
     return list(map_in_threads(refine, candidates, torch.get_num_threads()))
 
