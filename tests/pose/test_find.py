@@ -22,8 +22,8 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.footprint import explained_mask
 from depthpose.pose.geometry.surface import NEAR, prepare_surface
+from depthpose.pose.inliers import view_inliers
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
@@ -120,7 +120,7 @@ def test_readings_on_a_posed_surface_are_all_that_are_near_it() -> None:
     local_m = pose.inverse().apply(back_project(depth_m, K.double()))
     distance_m = torch.from_numpy(KDTree(surface.points_m.numpy()).query(local_m.numpy())[0])
     view = ViewInput(name="a", depth_m=depth_m, mask=depth_m > 0, K=K, object=model.name)
-    found, near = explained_mask(view, pose, surface), distance_m < NEAR * surface.diameter_m
+    found, near = view_inliers(view, pose, surface), distance_m < NEAR * surface.diameter_m
     assert int(near.sum()) > 500
     assert int((found != near).sum()) < 3, "but for rounding"
 

@@ -24,9 +24,9 @@ from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose import search
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.footprint import explained_frame_mask, why_background_excludes
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.geometry.surface import prepare_surface
+from depthpose.pose.inliers import frame_inliers, share_in_background
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
@@ -344,21 +344,22 @@ EVIDENCE = Evidence(
 )  # fmt: skip
 
 
-def judged(
+def registered(
     object: str, log_odds: float, columns: slice, number: int = 0, seen_through: float = 0.0
-) -> "search._JudgedPlace":
-    """An answer that explains some columns of an image of 4 x 40, of a certainty of 1."""
-    explained = torch.zeros(4, 40, dtype=torch.bool)
-    explained[:, columns] = True
+) -> search.Candidate:
+    """A candidate that explains some columns of an image of 4 x 40, of a certainty of 1."""
+    inliers = torch.zeros(4, 40, dtype=torch.bool)
+    inliers[:, columns] = True
     pose = pose_at(0.01 * number, 0.7, seed=number).double()
     evidence = replace(EVIDENCE, seen_through=seen_through, supported=20.0 - seen_through)
     estimate = PoseEstimate(
         name="", object=object, status="ok", certainty=1.0, copy_certainty=1.0,
         camera_from_model=pose.float(), evidence=evidence,
     )  # fmt: skip
-    return search._JudgedPlace(
-        object=object, pose=pose, explained=explained, estimate=estimate, log_odds=log_odds
-    )
+    return search.Candidate(
+        object=object, surface=PREPARED.surface, pose=pose, inliers=inliers, evidence=evidence,
+        log_odds=log_odds, estimate=estimate,
+    )  # fmt: skip
 
 
 PREPARED = KnownObject(number=0, model=bracket())
@@ -368,88 +369,121 @@ TARGETS = SearchTargets(
 )
 
 
+def suppress(
+    candidates: Sequence[search.Candidate], claimed: Sequence[search.Candidate] = ()
+) -> tuple[list[search.Candidate], dict[str, str]]:
+    """The candidates that stay, and of the others, by their objects, why they do not."""
+    maxima = search._suppress(candidates, claimed)
+    weighed = search._weigh_objects(maxima, candidates)
+    rejected = {one.object: one.rejected for one in [*maxima, *weighed] if one.rejected}
+    return search._remaining(weighed), rejected
+
+
 def test_what_may_be_either_of_two_objects_stays_unanswered_in_later_rounds() -> None:
-    both = [judged("a", 2.0, slice(0, 10)), judged("b", 1.9, slice(0, 10))]
-    kept, taken, misses = search._suppress(both, [], TARGETS)
+    both = [registered("a", 2.0, slice(0, 10)), registered("b", 1.9, slice(0, 10))]
+    kept, rejected = suppress(both)
     assert kept == []
-    assert {miss.object: miss.reason for miss in misses} == {
+    assert rejected == {
         "a": "what lies there may be b as well",
         "b": "what lies there is more likely a",
     }
-    assert search._suppress(both[:1], taken, TARGETS)[0] == []
+    maxima = search._remaining(search._suppress(both, []))
+    assert suppress(both[:1], maxima)[0] == []
 
 
 def test_the_object_whose_pose_is_contradicted_less_is_answered() -> None:
-    both = [judged("a", 4.0, slice(0, 10)), judged("b", -4.0, slice(0, 10), seen_through=12.0)]
-    (kept,), _, _ = search._suppress(both, [], TARGETS)
+    both = [
+        registered("a", 4.0, slice(0, 10)),
+        registered("b", -4.0, slice(0, 10), seen_through=12.0),
+    ]
+    (kept,), _ = suppress(both)
     assert kept.object == "a"
+    assert kept.estimate is not None
     assert kept.estimate.certainty is not None
     assert 0.8 < kept.estimate.certainty < 1
 
 
+def test_an_object_of_a_small_share_is_not_answered_as_another() -> None:
+    """By its log odds ``a`` is likelier, by its evidence ``b``: neither is taken for the other."""
+    both = [
+        registered("a", 5.0, slice(0, 10), seen_through=12.0),
+        registered("b", 4.0, slice(0, 10)),
+    ]
+    kept, rejected = suppress(both)
+    assert kept == []
+    assert rejected["a"] == "what lies there may be b as well"
+
+
 def test_what_lies_on_something_surer_is_no_rival_of_what_is_beside_it() -> None:
     """``b`` shares a third with ``a``, which is surer, and most with ``c``: ``c`` is itself."""
-    answers = [
-        judged("a", 5.0, slice(0, 20)),
-        judged("b", 4.0, slice(13, 33), 1),
-        judged("c", 2.0, slice(20, 40), 2),
+    candidates = [
+        registered("a", 5.0, slice(0, 20)),
+        registered("b", 4.0, slice(13, 33), 1),
+        registered("c", 2.0, slice(20, 40), 2),
     ]
-    kept, _, _ = search._suppress(answers, [], TARGETS)
-    assert [(place.object, place.estimate.object) for place in kept] == [("a", "a"), ("c", "c")]
+    kept, _ = suppress(candidates)
+    assert [candidate.object for candidate in kept] == ["a", "c"]
+    assert [one.estimate.object for one in kept if one.estimate is not None] == ["a", "c"]
 
 
 def test_poses_of_one_object_on_the_same_readings_are_one_answer() -> None:
-    answers = [judged("a", 3.0, slice(0, 20)), judged("a", 2.0, slice(10, 24), 1)]
-    kept, _, _ = search._suppress(answers, [], TARGETS)
-    assert [place.log_odds for place in kept] == [3.0]
+    candidates = [registered("a", 3.0, slice(0, 20)), registered("a", 2.0, slice(10, 24), 1)]
+    kept, rejected = suppress(candidates)
+    assert [candidate.log_odds for candidate in kept] == [3.0]
+    assert not rejected, "it is no other thing that was refused"
 
 
-def of_one_object(*log_odds: float) -> list["search._JudgedPlace"]:
-    """Places of one object, whose probabilities are those of their log odds."""
-    places = [judged("a", odds, slice(8 * k, 8 * k + 8), k) for k, odds in enumerate(log_odds)]
-    return [
-        replace(place, estimate=replace(place.estimate, certainty=1 / (1 + math.exp(-odds))))
-        for place, odds in zip(places, log_odds, strict=True)
-    ]
+def of_one_object(*log_odds: float) -> list[search.Candidate]:
+    """Instances of one object, whose probabilities are those of their log odds."""
+    instances = list[search.Candidate]()
+    for k, odds in enumerate(log_odds):
+        instance = registered("a", odds, slice(8 * k, 8 * k + 8), k)
+        instances.append(with_certainty(instance, 1 / (1 + math.exp(-odds))))
+    return instances
+
+
+def with_certainty(instance: search.Candidate, certainty: float) -> search.Candidate:
+    assert instance.estimate is not None
+    return replace(instance, estimate=replace(instance.estimate, certainty=certainty))
+
+
+def certainties(instances: Sequence[search.Candidate]) -> list[float | None]:
+    return [one.estimate.certainty for one in instances if one.estimate is not None]
 
 
 def test_a_second_place_needs_more_than_the_first() -> None:
     """Two to one is enough for what is there once, and too little beside what is surely there."""
-    (alone,), _ = search._weigh_instances(of_one_object(math.log(2)), TARGETS)
-    assert alone.estimate.certainty is not None
-    assert 0.6 < alone.estimate.certainty < 0.7
-    (first,), misses = search._weigh_instances(of_one_object(5.0, math.log(2)), TARGETS)
+    (alone,) = search._weigh_instances(of_one_object(math.log(2)), TARGETS)
+    assert not alone.rejected
+    (certainty,) = certainties([alone])
+    assert certainty is not None
+    assert 0.6 < certainty < 0.7
+    first, second = search._weigh_instances(of_one_object(5.0, math.log(2)), TARGETS)
     assert first.log_odds == 5
-    assert len(misses) == 1
-    assert "other poses and places" in misses[0].reason
+    assert not first.rejected
+    assert "other poses and places" in second.rejected
 
 
 def test_a_place_that_another_pose_explains_as_well_is_a_miss() -> None:
     """The place is right with 99 %, but each of two poses there with less than a half."""
-    (place,) = of_one_object(5.0)
-    undecided = replace(place, estimate=replace(place.estimate, certainty=0.47))
-    remaining, misses = search._weigh_instances([undecided], TARGETS)
-    assert not remaining
-    assert "47%" in misses[0].reason
+    (instance,) = of_one_object(5.0)
+    (undecided,) = search._weigh_instances([with_certainty(instance, 0.47)], TARGETS)
+    assert "47%" in undecided.rejected
 
 
 def test_a_box_holds_one() -> None:
     """Of two places in a box that are as likely neither is; in a whole frame both may be right."""
-    places = of_one_object(math.log(20), math.log(20))
-    remaining, _ = search._weigh_instances(places, TARGETS)
-    assert len(remaining) == 2
-    remaining, misses = search._weigh_instances(places, replace(TARGETS, instances="one at most"))
-    assert not remaining
-    assert "49%" in misses[0].reason, "20 of 41"
+    instances = of_one_object(math.log(20), math.log(20))
+    assert len(search._remaining(search._weigh_instances(instances, TARGETS))) == 2
+    weighed = search._weigh_instances(instances, replace(TARGETS, instances="one at most"))
+    assert all("49%" in instance.rejected for instance in weighed), "20 of 41"
 
 
 def test_in_a_bin_of_many_each_is_as_likely_as_alone() -> None:
     bin_of_six = of_one_object(5.0, 5.0, 5.0, 5.0, 5.0, math.log(2))
-    remaining, misses = search._weigh_instances(bin_of_six, TARGETS)
-    assert not misses
-    alone = [place.estimate.certainty for place in bin_of_six]
-    weighed = [place.estimate.certainty for place in remaining]
-    assert weighed == pytest.approx(alone, abs=0.01)
+    weighed = search._weigh_instances(bin_of_six, TARGETS)
+    assert search._remaining(weighed) == weighed
+    assert certainties(weighed) == pytest.approx(certainties(bin_of_six), abs=0.01)
 
 
 def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
@@ -461,11 +495,11 @@ def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
     wall[:, 100:220] = 1.25 - 0.0005 * torch.arange(240)[:, None]  # neither bracket
     depth_m = torch.where(mask, torch.minimum(seen.float(), wall), wall)
     frame = prepare_frame(depth_m, K.float())
-    assert "would lie in" in why_background_excludes(frame, pose.double(), surface)
+    assert share_in_background(frame, pose.double(), surface) > search._MOST_SUNK
     before = Rigid(pose.R, pose.t_m - torch.tensor([0.0, 0.0, 0.15]))
-    assert why_background_excludes(frame, before.double(), surface) == ""
+    assert share_in_background(frame, before.double(), surface) <= search._MOST_SUNK
     gap = replace(frame, depth_m=torch.where(grow_mask(mask, 12), 3.0, frame.depth_m))
-    assert why_background_excludes(gap, pose.double(), surface) == ""
+    assert share_in_background(gap, pose.double(), surface) <= search._MOST_SUNK
 
 
 def test_proposals_at_one_place_leave_room_for_others(
@@ -486,14 +520,16 @@ def test_proposals_at_one_place_leave_room_for_others(
     monkeypatch.setattr(search, "propose_in_frame", propose)
     targets = replace(TARGETS, objects=dict.fromkeys(names, known))
     everywhere = torch.ones_like(frame.depth_m, dtype=torch.bool)
-    places = search._propose(frame, everywhere, names, [], targets)
-    for name in names:
-        at_second = [p for p in places if p.object == name and torch.equal(p.pose.t_m, second.t_m)]
-        assert len(at_second) == 1, "one more place, not one more pose at a place"
-    assert sum(torch.equal(place.pose.t_m, first.t_m) for place in places) == search._MOST_PLACES
+    candidates = search._propose(frame, everywhere, names, [], targets)
+    at_first = [one for one in candidates if torch.equal(one.pose.t_m, first.t_m)]
+    at_second = [one.object for one in candidates if torch.equal(one.pose.t_m, second.t_m)]
+    assert at_second == names, "one more place of each, not one more pose at a place"
+    assert len(at_first) == search._MOST_PROPOSALS
 
 
-def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registration) -> None:
+def test_the_best_evidence_leads_a_place_not_the_first_proposal(
+    net: Registration, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each proposal is refined on what it explains: a coarse right one passes a wrong one."""
     known = net._find_object("bracket").prepare()
     truth = pose_at()
@@ -503,20 +539,26 @@ def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registratio
     half_turn = rotation_by(torch.tensor([0.0, 0.0, math.pi]).double())
     coarse = Rigid(truth.R.double(), truth.t_m.double() + torch.tensor([0.002, 0.001, 0.003]))
     wrong = Rigid(truth.R.double() @ half_turn, coarse.t_m)
-    places = [
-        search._Place(
-            object="bracket", pose=pose,
-            explained=explained_frame_mask(frame, pose, known.surface),
+    surface = known.surface
+    candidates = [
+        search.Candidate(
+            object="bracket", surface=surface, pose=pose,
+            inliers=frame_inliers(frame, pose, surface),
         )
         for pose in (wrong, coarse)
     ]  # fmt: skip
     targets = replace(TARGETS, objects={"bracket": known})
-    likely, hopeless = search._refine(places, frame, view, targets)
-    assert float((likely[0].pose.t_m - truth.t_m).norm()) < 0.001, "refined"
-    assert float(geodesic_rad(likely[0].pose.R.float(), truth.R.float())) < 0.1
-    assert len(likely) + len(hopeless) == len(places)
-    leader = search._group(likely)[0][0]
-    assert float((leader.pose.t_m - truth.t_m).norm()) < 0.001
+    refined = search._refine(candidates, frame, view, targets)
+    assert not any(candidate.rejected for candidate in refined)
+    leader = search._group(refined)[0][0]
+    assert float((leader.pose.t_m - truth.t_m).norm()) < 0.001, "refined"
+    assert float(geodesic_rad(leader.pose.R.float(), truth.R.float())) < 0.1
+
+    monkeypatch.setattr(search, "LEAST_POSSIBLE", 1.1)
+    hopeless = search._refine(candidates, frame, view, targets)
+    for candidate, other in zip(hopeless, refined, strict=True):
+        assert candidate.rejected
+        assert torch.equal(candidate.pose.t_m, other.pose.t_m), "it is a miss where it was compared"
 
 
 def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -525,9 +567,9 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
     camera = Camera(width=40, height=4, K=small)
     view = view_input(torch.full((4, 40), 0.7), None, camera, "a", "x", None)
     rounds = [
-        [judged("a", 7.0, slice(0, 8)), judged("a", 6.0, slice(8, 16), 1),
-         judged("b", 5.0, slice(16, 24), 2)],
-        [judged("a", 8.0, slice(24, 32), 3)],
+        [registered("a", 7.0, slice(0, 8)), registered("a", 6.0, slice(8, 16), 1),
+         registered("b", 5.0, slice(16, 24), 2)],
+        [registered("a", 8.0, slice(24, 32), 3)],
         [],
     ]  # fmt: skip
     searched = list[tuple[Sequence[str], int]]()
@@ -541,7 +583,7 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(search, "_propose", propose)
     monkeypatch.setattr(search, "rank_picks", lambda estimates, *_: estimates)
-    monkeypatch.setattr(search, "_judge", lambda *_: (rounds[len(searched) - 1], []))
+    monkeypatch.setattr(search, "_register", lambda *_: rounds[len(searched) - 1])
     targets = replace(TARGETS, objects={"a": PREPARED, "b": PREPARED})
     found = find_objects(view, targets)
     assert searched == [(["a", "b"], 40), (["a"], 16), (["a"], 8)]

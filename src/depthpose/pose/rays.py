@@ -156,6 +156,9 @@ def _find_planes(
 ) -> list[Bool[Tensor, " n"]]:
     """Find planes one after the other by RANSAC; return which readings lie on each.
 
+    Planes are ``n . x = 1``, as in the fit of the bend: residuals are shares of the distance of a
+    plane, where :func:`~depthpose.pose.planes.largest_plane` measures distances from it.
+
     Args:
         rays: of the readings, with z = 1.
         reading_m: values of the depth image.

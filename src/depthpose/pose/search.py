@@ -1,17 +1,26 @@
-"""Known objects in a depth image without a mask: votes propose poses, the evidence decides.
+"""Known objects in a depth image without a mask, by their models alone.
 
-Point pairs of the whole image, or of a region of it, vote for poses of each object. Each proposal
-is refined on the readings that it explains, and compared with the image. Proposals that explain the
-same readings are one place; there the object is estimated from the readings that the best proposal
-explains. Places that explain the same readings compete.
+The image, or a region of it, is searched in rounds:
+
+1. propose: point pairs vote for poses of each object, the candidates;
+2. refine: each is refined by ICP on its inliers, the readings that it explains, and compared with
+   the image;
+3. group: candidates of one object with mostly the same inliers are starts of one registration;
+4. register: the object is estimated from the inliers of the best candidate of its group;
+5. non-maximum suppression: of candidates that share inliers the likeliest stays;
+6. objects that explain the same inliers share the probability of one.
+
+At the end the instances of each object are weighed by each other. A stage that rejects a candidate
+says why; the best of them is the nearest miss of an object that is not found.
 """
 
+import math
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -22,9 +31,10 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import cloud_from_depth, require_same_size, why_nothing_seen
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.footprint import crop_to_region, explained_frame_mask, why_background_excludes
-from depthpose.pose.frame import Frame, prepare_frame
+from depthpose.pose.frame import Frame, crop_to_region, prepare_frame
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.icp import refine_roughly
+from depthpose.pose.inliers import frame_inliers, share_in_background
 from depthpose.pose.picking import rank_picks
 from depthpose.pose.pipeline import register
 from depthpose.pose.propose.image import propose_in_frame
@@ -46,20 +56,25 @@ from depthpose.pose.verify.probability import (
     probability_right,
 )
 
-_MOST_PLACES = 40
+_MOST_PROPOSALS = 40
 """Largest number of proposals that are looked at in an image."""
 _LEAST_PLACES = 6
 """Number of places of each object that are looked at in any case."""
 _ROUNDS = 4
 """An image is searched at most so many times for an object that is there more than once."""
 _MOST_TOGETHER = 8
-"""Largest number of proposals of one object at one place."""
+"""Largest number of candidates of one object in a group."""
 _LEAST_PIXELS = 100
 """Of the image at full resolution, that a pose must explain: fewer show no shape."""
-_SHARED = 0.3
-"""Estimates that explain so large a share of the same readings are of one thing; one stays."""
+_MOST_OVERLAP = 0.3
+"""Candidates with a larger overlap are of one thing: the likeliest suppresses the others."""
 _SAME_PLACE = 0.5
-"""Poses that explain so much of the same readings are at one place; two objects compete there."""
+"""Candidates with a larger overlap are at one place: those of one object are a group, those of
+several objects are rivals."""
+_MOST_SUNK = 0.05
+"""Largest share of the surface that may lie in a bin, table or wall: right poses err by less."""
+_LEAST_INSIDE = 0.5
+"""Least share of the inliers that must lie in the region of the only instance."""
 
 
 Instances = Literal["one", "one at most", "any number"]  #: see ``SearchTargets.instances``
@@ -87,40 +102,37 @@ class SearchTargets:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Place:
-    """Where an object may be: a pose, and the readings of the frame that it explains."""
+class Candidate:
+    """A pose that an object may have in the image, and what is known of it so far."""
 
-    object: str
-    pose: Rigid
-    explained: Bool[Tensor, "h w"]
+    object: str  #: its name
+    surface: Surface  #: of the object
+    pose: Rigid  #: ``camera_from_model``
+    inliers: Bool[Tensor, "h w"]  #: readings of the frame that the pose explains
+    evidence: Evidence | None = None  #: of the pose; None: it was not compared with the image
+    log_odds: float = -math.inf  #: of the pose being right, by its evidence
+    estimate: PoseEstimate | None = None  #: of the object, where it was registered
+    rejected: str = ""  #: why the object is not there, in a sentence; empty while it may be
 
     @cached_property
     def pixels(self) -> Int64[Tensor, " n"]:
-        """Indices of the readings that it explains, row after row."""
-        return self.explained.flatten().nonzero()[:, 0]
+        """Indices of the inliers, row after row."""
+        return self.inliers.flatten().nonzero()[:, 0]
 
-    def shared_with(self, other: "_Place") -> float:
-        """Share of the smaller one's readings that both explain."""
-        both_px = int(other.explained.flatten()[self.pixels].count_nonzero())
+    def overlap(self, other: "Candidate") -> float:
+        """Compute the overlap coefficient: share of the fewer inliers that both have."""
+        both_px = int(other.inliers.flatten()[self.pixels].count_nonzero())
         return both_px / max(1, min(len(self.pixels), len(other.pixels)))
 
+    @property
+    def middle_m(self) -> Float[Tensor, "3"]:
+        """The middle of the posed object, in the camera frame."""
+        return self.pose.apply(self.surface.middle_m[None])[0]
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _JudgedPlace(_Place):
-    """A place whose object was estimated."""
-
-    estimate: PoseEstimate
-    log_odds: float  #: of its being right
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Miss:
-    """A place at which an object was refused."""
-
-    object: str  #: its name
-    middle_m: Float[Tensor, "3"]  #: of the proposed object, in the camera frame
-    agreement: float  #: share of what was compared that supports the pose
-    reason: str  #: of the refusal
+    @property
+    def agreement(self) -> float:
+        """Share of what was compared that supports the pose, 0..1."""
+        return 0.0 if self.evidence is None else self.evidence.agreement
 
 
 def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
@@ -147,176 +159,190 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     frame = prepare_frame(region.depth_m, region.K, smallest_m, region.background)
     is_unclaimed = region.mask[:: frame.step, :: frame.step].clone()
 
-    # Round after round: propose, refine, judge, suppress. What is posed claims its readings.
     names = list(targets.objects)
-    posed: list[_JudgedPlace] = []
-    claimed: list[_JudgedPlace] = []  # posed, or of one of several objects
-    misses: list[_Miss] = []
+    examined: list[Candidate] = []  # what each stage makes of them
+    claimed: list[Candidate] = []  # found, or of one of several objects
+    found: list[Candidate] = []
     for _ in range(1 if targets.is_single else _ROUNDS):
-        proposals = _propose(frame, is_unclaimed, names, claimed, targets)
-        likely, hopeless = _refine(proposals, frame, region, targets)
-        judged, rejected = _judge(_group(likely), frame, region, targets)
-        misses += hopeless + rejected
-        if targets.is_single:
-            judged, outside = _within(judged, is_unclaimed, targets)
-            misses += outside
-        kept, claimed, uncertain = _suppress(judged, claimed, targets)
-        misses += uncertain
-        posed += kept
-        for place in kept:
-            is_unclaimed &= ~place.explained
+        proposed = _propose(frame, is_unclaimed, names, claimed, targets)
+        refined = _refine(proposed, frame, region, targets)
+        registered = _register(_group(refined), frame, region, is_unclaimed, targets)
+        maxima = _suppress(registered, claimed)
+        answered = _weigh_objects(maxima, registered)
+        examined += [*refined, *registered, *maxima, *answered]
+
+        # The likeliest claim their inliers, though it may be open which object they show.
+        claimed += _remaining(maxima)
+        new = _remaining(answered)
+        found += new
+        for candidate in new:
+            is_unclaimed &= ~candidate.inliers
+
         # What is there twice may be there more often; what is there once is not looked for again.
-        count = Counter(place.object for place in posed)
-        names = sorted({place.object for place in kept if count[place.object] > 1})
+        count = Counter(candidate.object for candidate in found)
+        names = sorted({candidate.object for candidate in new if count[candidate.object] > 1})
         if not names:
             break
 
-    # The places of one object are weighed by each other.
-    posed, unlikely = _weigh_instances(posed, targets)
-    misses += unlikely
-    posed.sort(key=lambda place: -place.log_odds)
+    weighed = _weigh_instances(found, targets)
+    examined += weighed
 
-    # An estimate for each place, and for each object without one a refusal.
+    # An estimate of each instance, and for each object without one a refusal.
     spent_s = time.perf_counter() - began
     estimates: list[PoseEstimate] = []
-    for place in posed:
-        estimate = with_status(place.estimate, targets.config.min_certainty)
+    for candidate in _rank(weighed):
+        assert candidate.estimate is not None, "what is found was registered"
+        estimate = with_status(candidate.estimate, targets.config.min_certainty)
         estimates.append(replace(estimate, seconds={**estimate.seconds, "search": spent_s}))
     if not targets.is_single:
         surfaces = {name: target.surface for name, target in targets.objects.items()}
         estimates = rank_picks(estimates, region, surfaces)
-    missing = set(targets.objects) - {place.object for place in posed}
-    estimates += [
-        nothing_found(view, name, [miss for miss in misses if miss.object == name], spent_s)
-        for name in targets.objects
-        if name in missing
-    ]
+    found_names = {candidate.object for candidate in _remaining(weighed)}
+    rejected = [candidate for candidate in examined if candidate.rejected]
+    for name in targets.objects:
+        if name not in found_names:
+            misses = [candidate for candidate in rejected if candidate.object == name]
+            estimates.append(nothing_found(view, name, misses, spent_s))
     if len(estimates) == 1:
         return [replace(estimates[0], name=view.name)]
     return [replace(estimate, name=f"{view.name}_{k}") for k, estimate in enumerate(estimates)]
 
 
-class _Proposal(NamedTuple):
-    """A pose that votes propose."""
-
-    score: float  #: by :func:`~depthpose.pose.propose.image.score_by_image`
-    object: str  #: its name
-    pose: Rigid  #: of the object
+def _remaining(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Leave out the rejected candidates."""
+    return [candidate for candidate in candidates if not candidate.rejected]
 
 
 def _propose(
     frame: Frame,
     is_unclaimed: Bool[Tensor, "h w"],
     names: Sequence[str],
-    claimed: Sequence[_Place],
+    claimed: Sequence[Candidate],
     targets: SearchTargets,
-) -> list[_Place]:
+) -> list[Candidate]:
     """Propose poses: the best of all objects, and some places of each; none at a claimed place."""
 
-    def propose_object(name: str) -> list[_Proposal]:
-        """Propose poses of one object, the best first."""
+    def propose_object(name: str) -> list[tuple[float, str, Rigid]]:
+        """Propose poses of one object: their scores, the best first, its name, and the poses."""
         pairs = targets.objects[name].pairs
-        poses, score = propose_in_frame(frame, is_unclaimed, pairs, len(names))
-        return [
-            _Proposal(score=float(score[k]), object=name, pose=poses[k])
-            for k in range(min(len(score), _MOST_PLACES))
-        ]
+        poses, scores = propose_in_frame(frame, is_unclaimed, pairs, len(names))
+        best = scores.tolist()[:_MOST_PROPOSALS]
+        return [(score, name, poses[k]) for k, score in enumerate(best)]
 
     proposals = [
         proposal
-        for group in map_in_threads(propose_object, names, torch.get_num_threads())
-        for proposal in group
+        for of_object in map_in_threads(propose_object, names, torch.get_num_threads())
+        for proposal in of_object
     ]
-    proposals.sort(key=lambda proposal: -proposal.score)
+    proposals.sort(key=lambda proposal: -proposal[0])
 
-    # The best of all objects, several at one place too: they are joint starts of its refinement.
+    # The best of all objects, several at one place too: they are joint starts of its registration.
     # Beyond these, only proposals at new places of objects with few places yet.
-    places: list[_Place] = []
-    count_of_object = Counter[str]()
-    for number, proposal in enumerate(proposals):
-        if number >= _MOST_PLACES and count_of_object[proposal.object] >= _LEAST_PLACES:
+    candidates: list[Candidate] = []
+    places_of_object = Counter[str]()
+    for number, (_, name, pose) in enumerate(proposals):
+        if number >= _MOST_PROPOSALS and places_of_object[name] >= _LEAST_PLACES:
             continue
-        surface = targets.objects[proposal.object].surface
-        explained = explained_frame_mask(frame, proposal.pose, surface)
-        place = _Place(object=proposal.object, pose=proposal.pose, explained=explained)
-        is_claimed = any(place.shared_with(other) > _SHARED for other in claimed)
-        if is_claimed or len(place.pixels) * frame.step**2 < _LEAST_PIXELS:
+        surface = targets.objects[name].surface
+        inliers = frame_inliers(frame, pose, surface)
+        candidate = Candidate(object=name, surface=surface, pose=pose, inliers=inliers)
+        is_claimed = any(candidate.overlap(other) > _MOST_OVERLAP for other in claimed)
+        if is_claimed or len(candidate.pixels) * frame.step**2 < _LEAST_PIXELS:
             continue
-        same_object = [other for other in places if other.object == place.object]
-        is_new = all(place.shared_with(other) <= _SAME_PLACE for other in same_object)
+        same_object = [other for other in candidates if other.object == name]
+        is_new = all(candidate.overlap(other) <= _SAME_PLACE for other in same_object)
         if is_new:
-            count_of_object[proposal.object] += 1
-        if is_new or number < _MOST_PLACES:
-            places.append(place)
-    return places
+            places_of_object[name] += 1
+        if is_new or number < _MOST_PROPOSALS:
+            candidates.append(candidate)
+    return candidates
 
 
 def _refine(
-    places: Sequence[_Place], frame: Frame, view: ViewInput, targets: SearchTargets
-) -> tuple[list[_Place], list[_Miss]]:
-    """Refine each proposal on the readings that it explains; rank them by their evidence.
-
-    Returns:
-        The proposals that may be right, the likeliest first; and the hopeless ones.
-    """
+    candidates: Sequence[Candidate], frame: Frame, view: ViewInput, targets: SearchTargets
+) -> list[Candidate]:
+    """Refine each candidate on its inliers; reject those that the image then contradicts."""
     end_diameters = targets.config.icp.end_distance_diameters
 
-    def refine(place: _Place) -> tuple[Rigid, Evidence]:
-        """Refine the pose of a place, and compare it with the image."""
-        surface = targets.objects[place.object].surface
-        cloud_m = _readings_of(place, frame, view)
-        pose = refine_roughly(cloud_m, place.pose[None], surface, end_diameters)[0]
+    def refine(candidate: Candidate) -> Candidate:
+        """Refine the pose of one candidate, and compare it with the image."""
+        surface = candidate.surface
+        cloud_m = _lift_inliers(candidate, frame, view)
+        pose = refine_roughly(cloud_m, candidate.pose[None], surface, end_diameters)[0]
         observation = observe(cloud_m, view, surface, is_masked=False)
-        return pose, compare(observation, pose, surface)
-
-    likely: list[tuple[float, _Place]] = []
-    hopeless: list[_Miss] = []
-    refined = map_in_threads(refine, places, torch.get_num_threads())
-    for place, (pose, evidence) in zip(places, refined, strict=True):
+        evidence = compare(observation, pose, surface)
+        refined = _move(candidate, pose, evidence, frame, targets)
         probability = probability_right(evidence, is_expected=targets.is_expected)
         if probability < LEAST_POSSIBLE:
             reason = explain_doubt(evidence, probability, is_masked=False)
-            hopeless.append(_miss_at(place, evidence, reason, targets))
-            continue
-        explained = explained_frame_mask(frame, pose, targets.objects[place.object].surface)
-        likely.append((probability, replace(place, pose=pose, explained=explained)))
-    likely.sort(key=lambda pair: -pair[0])
-    return [place for _, place in likely], hopeless
+            return replace(refined, rejected=reason)
+        return refined
+
+    return list(map_in_threads(refine, candidates, torch.get_num_threads()))
 
 
-def _readings_of(place: _Place, frame: Frame, view: ViewInput) -> Float[Tensor, "n 3"]:
-    """Collect the readings that a place explains, of the unthinned view, in the camera frame."""
+def _lift_inliers(candidate: Candidate, frame: Frame, view: ViewInput) -> Float[Tensor, "n 3"]:
+    """Lift the inliers of a candidate to points, of the unthinned view, in the camera frame."""
     height, width = view.depth_m.shape
-    mask = place.explained.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
+    mask = candidate.inliers.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
     part = crop_to_region(replace(view, mask=mask[:height, :width]), margin=0)
     return cloud_from_depth(part.depth_m, part.mask, part.K)
 
 
-def _group(places: Sequence[_Place]) -> list[list[_Place]]:
-    """Gather proposals of an object that explain the same readings; the likeliest leads each."""
-    groups: list[list[_Place]] = []
-    for place in places:
-        same = [group for group in groups if group[0].object == place.object]
-        group = next((group for group in same if place.shared_with(group[0]) > _SAME_PLACE), None)
+def _move(
+    candidate: Candidate, pose: Rigid, evidence: Evidence, frame: Frame, targets: SearchTargets
+) -> Candidate:
+    """Move a candidate to another pose, with its inliers and its evidence there."""
+    return replace(
+        candidate,
+        pose=pose,
+        inliers=frame_inliers(frame, pose, candidate.surface),
+        evidence=evidence,
+        log_odds=log_odds_right(evidence, is_expected=targets.is_expected),
+    )
+
+
+def _group(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Group the candidates of one object at one place; the likeliest leads each group."""
+    groups: list[list[Candidate]] = []
+    for candidate in _rank(candidates):
+        group = next((group for group in groups if _is_same_place(candidate, group[0])), None)
         if group is None:
-            groups.append([place])
+            groups.append([candidate])
         elif len(group) < _MOST_TOGETHER:
-            group.append(place)
+            group.append(candidate)
     return groups
 
 
-def _judge(
-    groups: Sequence[Sequence[_Place]], frame: Frame, view: ViewInput, targets: SearchTargets
-) -> tuple[list[_JudgedPlace], list[_Miss]]:
-    """Estimate the object of each place from what its best pose explains; separate refusals."""
+def _rank(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Sort the remaining candidates, the likeliest first."""
+    return sorted(_remaining(candidates), key=lambda candidate: -candidate.log_odds)
 
-    def estimate_place(numbered: tuple[int, Sequence[_Place]]) -> PoseEstimate:
-        """Estimate the object of a group of proposals, which has a number."""
+
+def _is_same_place(candidate: Candidate, leader: Candidate) -> bool:
+    """Whether a candidate is of the object and at the place of the leader of a group."""
+    return candidate.object == leader.object and candidate.overlap(leader) > _SAME_PLACE
+
+
+def _register(
+    groups: Sequence[Sequence[Candidate]],
+    frame: Frame,
+    view: ViewInput,
+    is_region: Bool[Tensor, "h w"],
+    targets: SearchTargets,
+) -> list[Candidate]:
+    """Register the object of each group, from all its poses, to the inliers of its leader.
+
+    ``is_region``: the readings among which the object is, where one instance is expected.
+    """
+
+    def register_group(numbered: tuple[int, Sequence[Candidate]]) -> PoseEstimate:
+        """Register the object of one group, which has a number."""
         number, group = numbered
         leader = group[0]
         cloud = CloudInput(
             name=f"{view.name}_{number}",
-            points_m=_readings_of(leader, frame, view),
+            points_m=_lift_inliers(leader, frame, view),
             object=leader.object,
             view=view,
             is_masked=False,
@@ -328,136 +354,137 @@ def _judge(
             targets.objects[leader.object],
             targets.config,
             watch,
-            proposals=Rigid.stack([place.pose for place in group]),
+            proposals=Rigid.stack([candidate.pose for candidate in group]),
             is_expected=targets.is_expected,
         )
         return answer(cloud, watch, work)
 
-    judged: list[_JudgedPlace] = []
-    misses: list[_Miss] = []
-    estimates = map_in_threads(estimate_place, enumerate(groups), torch.get_num_threads())
-    for estimate, group in zip(estimates, groups, strict=True):
-        surface = targets.objects[estimate.object].surface
-        evidence = estimate.evidence
-        reason = estimate.reason
-        if estimate.camera_from_model is not None:
-            reason = why_background_excludes(frame, estimate.camera_from_model.double(), surface)
-        if estimate.camera_from_model is None or evidence is None or reason:
-            misses.append(_miss_at(group[0], evidence, reason, targets))
-            continue
-        pose = estimate.camera_from_model.double()
-        judged.append(
-            _JudgedPlace(
-                object=estimate.object,
-                pose=pose,
-                explained=explained_frame_mask(frame, pose, surface),
-                estimate=estimate,
-                log_odds=log_odds_right(evidence, is_expected=targets.is_expected),
-            )
+    estimates = map_in_threads(register_group, enumerate(groups), torch.get_num_threads())
+    return [
+        _take_estimate(group[0], estimate, frame, is_region, targets)
+        for estimate, group in zip(estimates, groups, strict=True)
+    ]
+
+
+def _take_estimate(
+    candidate: Candidate,
+    estimate: PoseEstimate,
+    frame: Frame,
+    is_region: Bool[Tensor, "h w"],
+    targets: SearchTargets,
+) -> Candidate:
+    """Give a candidate its estimate; reject what is refused, or lies where no object can be."""
+    evidence = estimate.evidence
+    if estimate.camera_from_model is None:
+        return replace(candidate, evidence=evidence, rejected=estimate.reason)
+    assert evidence is not None, "poses in a view are compared with it"
+
+    # No object lies in its background.
+    pose = estimate.camera_from_model.double()
+    sunk_share = share_in_background(frame, pose, candidate.surface)
+    if sunk_share > _MOST_SUNK:
+        reason = (
+            f"{sunk_share:.0%} of it would lie in the bin, table or wall before which it is seen"
         )
-    return judged, misses
+        return replace(candidate, evidence=evidence, rejected=reason)
+
+    # The only instance lies in the region that was given.
+    posed = replace(_move(candidate, pose, evidence, frame, targets), estimate=estimate)
+    inside_share = float(is_region[posed.inliers].double().mean())
+    if targets.is_single and not inside_share > _LEAST_INSIDE:  # without inliers it is NaN
+        return replace(posed, rejected="most of it lies outside the given region")
+    return posed
 
 
-def _miss_at(
-    place: _Place, evidence: Evidence | None, reason: str, targets: SearchTargets
-) -> _Miss:
-    """Describe a place at which an object was refused."""
-    surface = targets.objects[place.object].surface
-    return _Miss(
-        object=place.object,
-        middle_m=place.pose.apply(surface.middle_m[None])[0],
-        agreement=0.0 if evidence is None else evidence.agreement,
-        reason=reason,
-    )
+def _suppress(candidates: Sequence[Candidate], claimed: Sequence[Candidate]) -> list[Candidate]:
+    """Suppress each candidate that overlaps a likelier one, or one that has claimed its inliers.
+
+    Returns:
+        The maxima, which nothing suppresses; and, rejected, those that another object suppresses.
+        What is suppressed by its own object is the same instance, and left out.
+    """
+    maxima: list[Candidate] = []
+    suppressed: list[Candidate] = []
+    for candidate in _rank(candidates):
+        likelier = [*claimed, *maxima]
+        overlapping = (other for other in likelier if candidate.overlap(other) > _MOST_OVERLAP)
+        suppressor = next(overlapping, None)
+        if suppressor is None:
+            maxima.append(candidate)
+        elif suppressor.object != candidate.object:
+            reason = f"what lies there is more likely {suppressor.object}"
+            suppressed.append(replace(candidate, rejected=reason))
+    return [*maxima, *suppressed]
 
 
-def _weigh_instances(
-    accepted: Sequence[_JudgedPlace], targets: SearchTargets
-) -> tuple[list[_JudgedPlace], list[_Miss]]:
-    """Weigh the places of each object by each other; separate poses that are likelier wrong.
+def _weigh_objects(maxima: Sequence[Candidate], candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Weigh each maximum by its rivals, the other objects at its place, one of which is there.
 
-    A pose may be likelier wrong than right because another place is surer, and a table holds one
+    Args:
+        maxima: what suppression leaves of the candidates.
+        candidates: all that were registered, which the rivals are taken from.
+
+    Returns:
+        The maxima with their shares of the probability of one object; rejected where it is small.
+    """
+    ranked = _rank(candidates)
+    weighed: list[Candidate] = []
+    for candidate in _remaining(maxima):
+        # The likeliest of each other object. What is likelier than a maximum and suppressed is of
+        # another place.
+        rivals = {candidate.object: candidate}
+        for other in ranked[ranked.index(candidate) + 1 :]:
+            if candidate.overlap(other) > _SAME_PLACE:
+                rivals.setdefault(other.object, other)
+        estimates = [rival.estimate for rival in rivals.values() if rival.estimate is not None]
+        likeliest, shares = likeliest_object(estimates)
+        # With a share so large it is itself the likeliest.
+        if float(shares[0]) >= LEAST_SHARE:
+            weighed.append(replace(candidate, estimate=likeliest))
+        else:
+            others = ", ".join(name for name in rivals if name != candidate.object)
+            reason = f"what lies there may be {others} as well"
+            weighed.append(replace(candidate, rejected=reason))
+    return weighed
+
+
+def _weigh_instances(found: Sequence[Candidate], targets: SearchTargets) -> list[Candidate]:
+    """Weigh the instances of each object by each other; reject poses that are likelier wrong.
+
+    A pose may be likelier wrong than right because another instance is surer, and a table holds one
     of each object; or because another pose explains its place as well.
     """
-    remaining: list[_JudgedPlace] = []
-    misses: list[_Miss] = []
-    for name in dict.fromkeys(place.object for place in accepted):
-        places = [place for place in accepted if place.object == name]
-        log_odds = torch.tensor([place.log_odds for place in places], dtype=torch.float64)
+    weighed: list[Candidate] = []
+    for name in dict.fromkeys(candidate.object for candidate in found):
+        instances = [candidate for candidate in found if candidate.object == name]
+        log_odds = torch.tensor([one.log_odds for one in instances], dtype=torch.float64)
         probabilities = probability_of_instances(log_odds, is_single=targets.is_single)
         shares = probabilities / log_odds.sigmoid()  # of the probability that each has by itself
-        for place, share in zip(places, shares.tolist(), strict=True):
-            estimate = with_share(place.estimate, share)
-            assert estimate.certainty is not None, "judged poses have evidence"
-            if estimate.certainty >= targets.config.limits.min_probability:
-                remaining.append(replace(place, estimate=estimate))
-            else:
+        for candidate, share in zip(instances, shares.tolist(), strict=True):
+            assert candidate.estimate is not None, "what is found was registered"
+            estimate = with_share(candidate.estimate, share)
+            assert estimate.certainty is not None, "registered poses have evidence"
+            reason = ""
+            if estimate.certainty < targets.config.limits.min_probability:
                 reason = (
                     "weighed against other poses and places, it is right with a probability of "
                     f"{estimate.certainty:.0%}"
                 )
-                misses.append(_miss_at(place, estimate.evidence, reason, targets))
-    return remaining, misses
-
-
-def _within(
-    judged: Sequence[_JudgedPlace], is_region: Bool[Tensor, "h w"], targets: SearchTargets
-) -> tuple[list[_JudgedPlace], list[_Miss]]:
-    """Separate the places that lie mostly in a region from those that do not, as misses."""
-    inside: list[_JudgedPlace] = []
-    misses: list[_Miss] = []
-    for place in judged:
-        if float(is_region[place.explained].double().mean()) > 0.5:
-            inside.append(place)
-        else:
-            reason = "most of it lies outside the given region"
-            misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
-    return inside, misses
-
-
-def _suppress(
-    judged: Sequence[_JudgedPlace], before: Sequence[_JudgedPlace], targets: SearchTargets
-) -> tuple[list[_JudgedPlace], list[_JudgedPlace], list[_Miss]]:
-    """Keep places in order of probability, each only if no surer one explains its readings.
-
-    Returns:
-        The places that are kept; all places that claim readings, those of ``before`` and those that
-        may show one of several objects too; and, as misses, the places at which an object is not
-        kept because of another.
-    """
-    kept: list[_JudgedPlace] = []
-    misses: list[_Miss] = []
-    taken = list(before)
-    ranked = sorted(judged, key=lambda place: -place.log_odds)
-    for number, place in enumerate(ranked):
-        # Its readings may be taken by a surer place, even of the same object.
-        surer = next((other for other in taken if place.shared_with(other) > _SHARED), None)
-        if surer is not None:
-            if surer.object != place.object:
-                reason = f"what lies there is more likely {surer.object}"
-                misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
-            continue
-        taken.append(place)
-
-        # Other objects at this place share the probability of one with it.
-        rivals = {place.object: place}
-        for other in ranked[number + 1 :]:
-            if place.shared_with(other) > _SAME_PLACE:
-                rivals.setdefault(other.object, other)
-        estimate, shares = likeliest_object([rival.estimate for rival in rivals.values()])
-        if float(shares.max()) >= LEAST_SHARE:
-            kept.append(replace(place, estimate=estimate))
-        else:
-            others = ", ".join(name for name in rivals if name != place.object)
-            reason = f"what lies there may be {others} as well"
-            misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
-    return kept, taken, misses
+            weighed.append(replace(candidate, estimate=estimate, rejected=reason))
+    return weighed
 
 
 def nothing_found(
-    view: ViewInput, object: str, misses: Sequence[_Miss], spent_s: float
+    view: ViewInput, object: str, rejected: Sequence[Candidate], spent_s: float
 ) -> PoseEstimate:
-    """Build the refusal of an object that an image does not surely show, with its nearest miss."""
+    """Build the refusal of an object that an image does not surely show, with its nearest miss.
+
+    Args:
+        view: depth and camera.
+        object: its name.
+        rejected: candidates of it.
+        spent_s: duration of the search.
+    """
     read_m = view.depth_m[view.mask & (view.depth_m > 0)]
     facts: dict[str, Any] = {"name": view.name, "object": object, "seconds": {"search": spent_s}}
     if len(read_m) == 0:
@@ -467,13 +494,13 @@ def nothing_found(
         f"{float(read_m.min()):.3g} to {float(read_m.max()):.3g} m: if they are right, give a "
         "mask, or look from nearer by"
     )
-    if not misses:
+    if not rejected:
         reason += ". No place in it is enough like the object to be compared"
     else:
-        nearest = max(misses, key=lambda miss: miss.agreement)
+        nearest = max(rejected, key=lambda candidate: candidate.agreement)
         x, y, z = nearest.middle_m.tolist()
         reason += (
-            f". Of {len(misses)} places that were compared the nearest miss, at ({x:.3f}, {y:.3f}, "
-            f"{z:.3f}) m: {nearest.reason}"
+            f". Of {len(rejected)} places that were compared the nearest miss, at ({x:.3f}, "
+            f"{y:.3f}, {z:.3f}) m: {nearest.rejected}"
         )
     return PoseEstimate(status="doubtful", reason=reason, **facts)

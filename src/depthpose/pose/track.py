@@ -19,9 +19,9 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import cloud_from_depth, require_same_size
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.geometry.surface import NEAR, Surface
 from depthpose.pose.icp import refine_best
+from depthpose.pose.planes import Plane, is_on_plane, largest_plane
 from depthpose.pose.refusals import Refused, unreadable_on_error
 from depthpose.pose.types import (
     Alternative,
@@ -367,40 +367,62 @@ def _carry_copies(estimate: PoseEstimate, pose: Rigid, first: PoseEstimate | Non
     return replace(estimate, copy_certainty=copy_certainty, alternatives=tuple(copies))
 
 
+class _Support(NamedTuple):
+    """A table or wall that an object lies on or before: a slab about a plane."""
+
+    plane: Plane
+    half_m: float  #: half the thickness of the slab
+
+    def holds(self, points_m: Float64[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        """Whether points lie in the slab."""
+        return self.plane.height_m(points_m).abs() < self.half_m
+
+
 def _mark_support(
     scene_m: Float64[Tensor, "n 3"], is_near: Bool[Tensor, " n"], posed_m: Float64[Tensor, "m 3"]
 ) -> Bool[Tensor, " n"]:
-    """Mark the points of a table or wall beside the object, onto which ICP would pull it.
+    """Mark the points of the supports of an object, onto which ICP would pull it.
+
+    A flat object that lies in its support cannot be told from it: then no point is marked.
 
     Args:
         scene_m: points about the object, in the camera frame.
         is_near: which of them may be the object's.
         posed_m: its surface at the last pose.
     """
-    # The largest planes beside the object, one after the other.
     is_support = torch.zeros_like(is_near)
     is_flat = torch.zeros(len(posed_m), dtype=torch.bool)
-    generator = torch.Generator().manual_seed(0)  # of RANSAC: the same frame, the same planes
-    for _ in range(_SUPPORTS):
-        beside_m = take_evenly(scene_m[~is_near & ~is_support], _SUPPORT_POINTS)
-        plane = largest_plane(beside_m, generator)
-        if plane is None:
-            break
-        normal, offset = plane
-        gap_m = (beside_m @ normal - offset)[is_on_plane(beside_m, plane)]
-        if len(gap_m) < _LEAST_POINTS:
-            break
-        rms_m = gap_m.square().mean().sqrt()
-        limit_m = _SUPPORT_DEVIATIONS * rms_m
-        is_support |= (scene_m @ normal - offset).abs() < limit_m
-        is_flat |= (posed_m @ normal - offset).abs() < limit_m
+    for support in _find_supports(scene_m[~is_near]):
+        is_support |= support.holds(scene_m)
+        is_flat |= support.holds(posed_m)
 
-    # A flat object that lies in its support cannot be told from it: no point is marked. If little
-    # is left of any other object, it was taken away.
+    # If little is left of an object that is not flat, it was taken away.
     left = int((is_near & ~is_support).sum())
     is_little_left = left < max(_LEAST_POINTS, _LEAST_LEFT_SHARE * int(is_near.sum()))
     is_object_flat = float(is_flat.double().mean()) > _FLAT_SHARE
     return torch.zeros_like(is_near) if is_little_left and is_object_flat else is_support
+
+
+def _find_supports(beside_m: Float64[Tensor, "n 3"]) -> list[_Support]:
+    """Find the largest planes of the points beside an object, one after the other.
+
+    A support is as thick as the deviations of its points from the plane say.
+    """
+    supports: list[_Support] = []
+    generator = torch.Generator().manual_seed(0)  # of RANSAC: the same frame, the same planes
+    for _ in range(_SUPPORTS):
+        some_m = take_evenly(beside_m, _SUPPORT_POINTS)
+        plane = largest_plane(some_m, generator)
+        if plane is None:
+            break
+        height_m = plane.height_m(some_m[is_on_plane(some_m, plane)])
+        if len(height_m) < _LEAST_POINTS:
+            break
+        rms_m = float(height_m.square().mean().sqrt())
+        support = _Support(plane, _SUPPORT_DEVIATIONS * rms_m)
+        supports.append(support)
+        beside_m = beside_m[~support.holds(beside_m)]
+    return supports
 
 
 def _mark_near(

@@ -15,7 +15,7 @@ from depthpose.pose.background import add_background
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets import Detection, mask_view, parse_box
 from depthpose.pose.datasets.dataset import write_mask
-from depthpose.pose.footprint import explained_mask
+from depthpose.pose.inliers import view_inliers
 from depthpose.pose.inputs import cloud_input, view_input
 from depthpose.pose.network_pose import GeoPoseNet, VotingDirections
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
@@ -138,7 +138,7 @@ def _search(target: _Target, view: ViewInput) -> list[_ShownPose]:
     for estimate in target.net.find(view, objects=target.model.name):
         shown_view = replace(view, name=estimate.name)
         if estimate.camera_from_model is not None:
-            mask = explained_mask(view, estimate.camera_from_model, surface)
+            mask = view_inliers(view, estimate.camera_from_model, surface)
             shown_view = replace(shown_view, mask=mask)
         shown_poses.append(_ShownPose(input=shown_view, estimate=estimate))
     return shown_poses

@@ -21,7 +21,7 @@ from depthpose.core.processes import find_rank
 from depthpose.core.rigid import Rigid
 from depthpose.core.run_folder import note_result
 from depthpose.pose.datasets import BopDataset
-from depthpose.pose.footprint import explained_mask
+from depthpose.pose.inliers import view_inliers
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.predictions import (
     CLOUD,
@@ -155,7 +155,7 @@ def _read_masked_by_pose(job: PoseJob[Any], prediction: Prediction, method: Pose
     estimator = method.estimator
     if pose is None or not isinstance(view, ViewInput) or estimate.object not in estimator.objects:
         return view
-    mask = explained_mask(view, pose, estimator.surface_of(estimate.object))
+    mask = view_inliers(view, pose, estimator.surface_of(estimate.object))
     return replace(view, name=estimate.name, mask=mask, object=estimate.object)
 
 
