@@ -18,7 +18,7 @@ from depthpose.pose.config import EstimateConfig, ObjectsConfig, VotingConfig
 from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.mesh import make_model, sample_surface
 from depthpose.pose.metrics import add_m
-from depthpose.pose.network_pose import CloudToPose
+from depthpose.pose.network_pose import CloudJob
 from depthpose.pose.propose.point_pairs import prepare_pairs, propose_poses
 from depthpose.pose.refusals import Refused
 from depthpose.pose.synthetic import SyntheticViews, make_part
@@ -160,7 +160,7 @@ def test_registration_without_icp_is_an_error() -> None:
 class Doubting(GeoPoseNet):
     """A network that takes none of its own answers."""
 
-    def _estimate_by_votes(self, job: CloudToPose) -> PoseEstimate:
+    def _estimate_by_votes(self, job: CloudJob) -> PoseEstimate:
         raise Refused("doubtful", f"{job.known.model.name} is doubted")
 
 
