@@ -87,6 +87,7 @@ def triangulate(match: Match, depth_input: DepthInput, rig: StereoRig | None) ->
     depth_m = None
     if rig is not None:
         depth_m = depth_from_disparity(disparity_px, rig)
+        # A camera with another baseline than that of the match, as of a synthesised view.
         own_rig = depth_input.camera
         if isinstance(own_rig, StereoRig) and own_rig is not rig:
             disparity_px = disparity_from_depth(depth_m, own_rig)

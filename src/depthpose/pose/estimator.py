@@ -38,7 +38,7 @@ from depthpose.pose.inputs import (
     view_input,
 )
 from depthpose.pose.pipeline import register
-from depthpose.pose.refusals import answer, unreadable_on_error
+from depthpose.pose.refusals import estimate_or_refusal, unreadable_on_error
 from depthpose.pose.search import Instances, SearchTargets, find_objects
 from depthpose.pose.track import track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
@@ -140,7 +140,7 @@ class PoseEstimator:
         known = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
         work = partial(register, pose_input, known, self.config, watch)
-        estimate = answer(pose_input, watch, work)
+        estimate = estimate_or_refusal(pose_input, watch, work)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
 

@@ -33,7 +33,7 @@ from depthpose.pose.icp import refine_best, rotate_starts
 from depthpose.pose.networks.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
 from depthpose.pose.pipeline import judge, propose_by_pairs
 from depthpose.pose.propose import fit_poses, meet_lines, vote_ransac
-from depthpose.pose.refusals import Refused, answer, unreadable_on_error
+from depthpose.pose.refusals import Refused, estimate_or_refusal, unreadable_on_error
 from depthpose.pose.types import (
     AnyInput,
     PoseEstimate,
@@ -207,7 +207,9 @@ class GeoPoseNet(PoseEstimator):
             if isinstance(job, PoseEstimate):
                 return job, None
             self._run_network([job])
-            voted = answer(pose_input, job.watch, partial(self._estimate_by_votes, job))
+            voted = estimate_or_refusal(
+                pose_input, job.watch, partial(self._estimate_by_votes, job)
+            )
             return voted, VotingDirections(job.voxels.points_m, job.directions)
 
     def _prepare(
@@ -237,7 +239,7 @@ class GeoPoseNet(PoseEstimator):
                 is_expected=is_expected,
             )
 
-        return answer(pose_input, watch, lift)
+        return estimate_or_refusal(pose_input, watch, lift)
 
     def _run_network(self, group: Sequence[CloudJob | PoseEstimate]) -> None:
         """Run the network once on all clouds of a group, and set their ``directions``."""
@@ -275,7 +277,9 @@ class GeoPoseNet(PoseEstimator):
         """
         if isinstance(job, PoseEstimate):
             return job
-        voted = answer(job.pose_input, job.watch, partial(self._estimate_by_votes, job))
+        voted = estimate_or_refusal(
+            job.pose_input, job.watch, partial(self._estimate_by_votes, job)
+        )
         may_register = self.config.register_refused and job.is_expected
         if not may_register or voted.status not in _DOUBTED:
             return voted
@@ -418,7 +422,7 @@ class DepthImageRegressor(PoseEstimator):
         _ = known.surface  # computed before any stage is timed
         watch = Stopwatch()
         work = partial(self._regress, pose_input, known, watch)
-        return answer(pose_input, watch, work)
+        return estimate_or_refusal(pose_input, watch, work)
 
     def _regress(self, pose_input: ViewInput, known: KnownObject, watch: Stopwatch) -> PoseEstimate:
         """Regress the pose of one object, and refine it.

@@ -38,7 +38,7 @@ from depthpose.pose.inliers import frame_inliers, share_in_background
 from depthpose.pose.picking import rank_picks
 from depthpose.pose.pipeline import register
 from depthpose.pose.propose.image import propose_in_frame
-from depthpose.pose.refusals import answer
+from depthpose.pose.refusals import estimate_or_refusal
 from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
 from depthpose.pose.verify.decide import (
     LEAST_SHARE,
@@ -365,7 +365,7 @@ def _register(
             proposals=Rigid.stack([candidate.pose for candidate in group]),
             is_expected=targets.is_expected,
         )
-        return answer(cloud, watch, work)
+        return estimate_or_refusal(cloud, watch, work)
 
     estimates = map_in_threads(register_group, enumerate(groups), torch.get_num_threads())
     return [
