@@ -192,6 +192,15 @@ def test_registration_that_finds_nothing_leaves_the_network_s_reason() -> None:
     assert "registration" in found.seconds
 
 
+def test_registration_that_fails_leaves_the_votes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> PoseEstimate:
+        raise InputError("the memory is full")
+
+    monkeypatch.setattr(Doubting, "_register_or_search", fail)
+    found = doubting_net().estimate_many([view(make_part("connector"), 0).input])[0]
+    assert (found.status, found.reason) == ("doubtful", "connector is doubted")
+
+
 @pytest.mark.slow
 def test_regions_that_may_show_anything_are_not_registered() -> None:
     samples = [view(make_part("connector"), index) for index in range(2)]

@@ -115,10 +115,7 @@ class GeoPoseNet(PoseEstimator):
     """By which the weights were loaded; empty where they came from memory."""
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        config = EstimateConfig() if config is None else config
-        if config.refusal is None:
-            config = replace(config, refusal=weights.refusal)
-        super().__init__(weights.models, config)
+        super().__init__(weights.models, config, weights.refusal)
         self.weights = weights
         self.terms = weights.facts.get("terms", "")
         """Terms of the weights that bind whoever uses them; empty without any."""
@@ -285,7 +282,8 @@ class GeoPoseNet(PoseEstimator):
             return voted
         watch = Stopwatch()
         with watch.stage("registration"):
-            registered = self._register_or_search(job.pose_input)
+            work = partial(self._register_or_search, job.pose_input)
+            registered = unreadable_on_error(job.pose_input, work)
         best = registered if registered.is_posed else voted
         return replace(best, seconds={**voted.seconds, **watch.seconds})
 
@@ -395,7 +393,7 @@ class DepthImageRegressor(PoseEstimator):
     needs_mask = True
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        super().__init__(weights.models, config)
+        super().__init__(weights.models, config, weights.refusal)
         if not isinstance(weights.network, DepthImageNet):
             raise InputError(
                 "these weights cast votes and regress no depth image; load them as GeoPoseNet"
