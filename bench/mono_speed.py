@@ -28,7 +28,7 @@ from shared import (
 from stereo_speed import peak_flops
 from torch.utils.flop_counter import FlopCounterMode
 
-from depthpose.core.camera import StereoRig
+from depthpose.core.camera import StereoRig, camera_of
 from depthpose.core.checkpoint import find_weights
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, Speed
 from depthpose.depth.disparity import resize_image, size_at_focal_length
@@ -132,7 +132,8 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
     match_flops = 0
     matcher = net.matcher
     if matcher is not None and uses_matcher(net):
-        match_s = warm_seconds(lambda: match_in_usual_range(matcher, left, right), device)
+        camera = camera_of(net.synthesiser.config.virtual_focal_px, (size[1], size[0]))
+        match_s = warm_seconds(lambda: match_in_usual_range(matcher, left, right, camera), device)
         match_flops = matcher_flops(net, *size)
 
     share_of_peak = None

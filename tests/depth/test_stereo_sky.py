@@ -17,7 +17,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
 from depthpose.depth.disparity import resize_match
-from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.estimator import FakestereoNet, single_image
 from depthpose.depth.export import make_export
 from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss
@@ -299,6 +299,25 @@ def test_a_lamp_that_is_no_sky_has_no_confidence_of_a_sky() -> None:
     assert found.confidence is not None
     assert not bool(found.is_sky.any())
     assert float(found.confidence[is_sky].max()) < 0.06
+    # What the search doubts stays doubted.
+    doubted = replace(match, confidence=torch.zeros(100, 100))
+    found = estimate_from_pair(pair, doubted)
+    assert found.confidence is not None
+    assert float(found.confidence.max()) == 0
+
+
+def test_the_sky_of_a_matched_image_has_the_generator_s_confidence() -> None:
+    """A matcher knows no sky: its confidence there is that of a disparity."""
+    sky = torch.zeros(4, 6, dtype=torch.bool)
+    sky[:2] = True
+    by_matcher = Match(disparity_px=torch.ones(4, 6), confidence=torch.full((4, 6), 0.05))
+    by_generator = Match(
+        disparity_px=torch.ones(4, 6), confidence=torch.full((4, 6), 0.9), is_sky=sky
+    )
+    joined = single_image._take_sky(by_matcher, by_generator)
+    assert joined.is_sky is sky
+    assert joined.confidence is not None
+    torch.testing.assert_close(joined.confidence, torch.where(sky, 0.9, 0.05))
 
 
 def test_the_sky_is_written_beside_the_depth(tmp_path: Path) -> None:

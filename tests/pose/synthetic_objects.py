@@ -14,7 +14,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, RefusalConfig
 from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.mesh import make_model
-from depthpose.pose.network_pose import CloudToPose, GeoPoseNet
+from depthpose.pose.network_pose import CloudJob, GeoPoseNet
 from depthpose.pose.networks.resunet import ResUNet, ResUNetConfig
 from depthpose.pose.synthetic.parts import make_circle, make_part_mesh, make_ring
 from depthpose.pose.types import Axis, ObjectModel, PoseEstimate, Symmetries
@@ -172,8 +172,8 @@ class Oracle(GeoPoseNet):
         self.wrong = changes.get("wrong", 0.0)
         self.calls: list[int] = []
 
-    def _run_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
-        ready = [one for one in group if isinstance(one, CloudToPose)]
+    def _run_network(self, group: Sequence[CloudJob | PoseEstimate]) -> None:
+        ready = [one for one in group if isinstance(one, CloudJob)]
         self.calls += [len(ready)] if ready else []
         for one in ready:
             one.directions = self._true(one.voxels.points_m, one.known.number)

@@ -20,7 +20,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, VotingConfig
 from depthpose.pose.mesh import make_model
-from depthpose.pose.network_pose import CloudToPose
+from depthpose.pose.network_pose import CloudJob
 from depthpose.pose.registration import Registration
 from depthpose.pose.types import PoseEstimate
 
@@ -60,10 +60,10 @@ class _Noisy(Oracle):
 
     generator = torch.Generator().manual_seed(0)
 
-    def _run_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
+    def _run_network(self, group: Sequence[CloudJob | PoseEstimate]) -> None:
         super()._run_network(group)
         for one in group:
-            assert isinstance(one, CloudToPose)
+            assert isinstance(one, CloudJob)
             noise = torch.randn(one.directions.shape, generator=self.generator)
             one.directions = one.directions + 0.03 * noise
 

@@ -166,6 +166,13 @@ def test_a_search_for_nothing_is_an_error() -> None:
         net.find(view_input(table(), None, CAMERA, "bracket", "a"), objects=[])
 
 
+def test_a_view_has_its_own_background() -> None:
+    net = Oracle(tiny_weights(bracket()), TRUTHS)
+    view = view_input(table(), None, CAMERA, "bracket", "a")
+    with pytest.raises(InputError, match="find: background= belong to a depth image, and a view"):
+        net.find(view, background=table())
+
+
 def cloud_of(model: ObjectModel, truth: Rigid) -> torch.Tensor:
     depth_m, mask = view_of(model, truth)
     return back_project(depth_m.double(), K)[mask].float()

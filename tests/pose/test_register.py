@@ -18,7 +18,7 @@ from depthpose.pose.config import EstimateConfig, ObjectsConfig, VotingConfig
 from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.mesh import make_model, sample_surface
 from depthpose.pose.metrics import add_m
-from depthpose.pose.network_pose import CloudToPose
+from depthpose.pose.network_pose import CloudJob
 from depthpose.pose.propose.point_pairs import prepare_pairs, propose_poses
 from depthpose.pose.refusals import Refused
 from depthpose.pose.synthetic import SyntheticViews, make_part
@@ -160,7 +160,7 @@ def test_registration_without_icp_is_an_error() -> None:
 class Doubting(GeoPoseNet):
     """A network that takes none of its own answers."""
 
-    def _estimate_by_votes(self, job: CloudToPose) -> PoseEstimate:
+    def _estimate_by_votes(self, job: CloudJob) -> PoseEstimate:
         raise Refused("doubtful", f"{job.known.model.name} is doubted")
 
 
@@ -190,6 +190,15 @@ def test_registration_that_finds_nothing_leaves_the_network_s_reason() -> None:
     found = doubting_net().estimate_many([given])[0]
     assert (found.status, found.reason) == ("doubtful", "connector is doubted")
     assert "registration" in found.seconds
+
+
+def test_registration_that_fails_leaves_the_votes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> PoseEstimate:
+        raise InputError("the memory is full")
+
+    monkeypatch.setattr(Doubting, "_register_or_search", fail)
+    found = doubting_net().estimate_many([view(make_part("connector"), 0).input])[0]
+    assert (found.status, found.reason) == ("doubtful", "connector is doubted")
 
 
 @pytest.mark.slow

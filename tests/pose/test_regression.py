@@ -56,6 +56,23 @@ def test_a_regressed_depth_image_has_no_refusals_to_register(weights: PoseWeight
         DepthImageRegressor(weights, EstimateConfig(register_refused=True))
 
 
+def test_limits_of_the_weights_hold(weights: PoseWeights) -> None:
+    strict = replace(weights, refusal=RefusalConfig(min_probability=0.99))
+    assert DepthImageRegressor(strict).config.limits.min_probability == 0.99
+    given = EstimateConfig(refusal=RefusalConfig(min_probability=0.7))
+    assert DepthImageRegressor(strict, given).config.limits.min_probability == 0.7
+
+
+def test_an_object_that_is_no_longer_seen_is_lost(weights: PoseWeights) -> None:
+    """A regressor cannot search for it, and the sequence goes on."""
+    view = seen()
+    wall = replace(view, name="wall", depth_m=torch.full_like(view.depth_m, 2.0))
+    frames = [view, wall, wall]
+    found = list(DepthImageRegressor(weights).track(frames, object="bracket", first=pose_at()))
+    assert [one.tracking for one in found] == ["tracked", "lost", "lost"]
+    assert "takes a depth image with a mask" in found[1].reason
+
+
 def test_blobs_far_from_their_middle_are_refused_and_stop_no_other(weights: PoseWeights) -> None:
     view = seen()
     mask = torch.zeros_like(view.mask)

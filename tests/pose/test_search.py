@@ -373,9 +373,9 @@ def suppress(
     candidates: Sequence[search.Candidate], claimed: Sequence[search.Candidate] = ()
 ) -> tuple[list[search.Candidate], dict[str, str]]:
     """The candidates that stay, and of the others, by their objects, why they do not."""
-    maxima = search._suppress(candidates, claimed)
+    maxima, suppressed = search._suppress(candidates, claimed)
     weighed = search._weigh_objects(maxima, candidates)
-    rejected = {one.object: one.rejected for one in [*maxima, *weighed] if one.rejected}
+    rejected = {one.object: one.rejected for one in [*suppressed, *weighed] if one.rejected}
     return search._remaining(weighed), rejected
 
 
@@ -387,7 +387,7 @@ def test_what_may_be_either_of_two_objects_stays_unanswered_in_later_rounds() ->
         "a": "what lies there may be b as well",
         "b": "what lies there is more likely a",
     }
-    maxima = search._remaining(search._suppress(both, []))
+    maxima, _ = search._suppress(both, [])
     assert suppress(both[:1], maxima)[0] == []
 
 

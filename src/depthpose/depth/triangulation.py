@@ -87,6 +87,7 @@ def triangulate(match: Match, depth_input: DepthInput, rig: StereoRig | None) ->
     depth_m = None
     if rig is not None:
         depth_m = depth_from_disparity(disparity_px, rig)
+        # A camera with another baseline than that of the match, as of a synthesised view.
         own_rig = depth_input.camera
         if isinstance(own_rig, StereoRig) and own_rig is not rig:
             disparity_px = disparity_from_depth(depth_m, own_rig)
@@ -120,8 +121,8 @@ def triangulate(match: Match, depth_input: DepthInput, rig: StereoRig | None) ->
 def _without_false_sky(match: Match, left: View) -> Match:
     """Return a match without sky in blank borders, and without any where it covers too little.
 
-    What was taken for sky with the probability p then has a disparity with the confidence 1 - p at
-    most.
+    What was taken for sky with the probability p has a disparity with a confidence of at most 1 - p
+    there, and no more than it had.
 
     Args:
         match: the match, at the size of the image.
@@ -135,7 +136,9 @@ def _without_false_sky(match: Match, left: View) -> Match:
     confidence = match.confidence
     if confidence is not None:
         is_discarded = match.is_sky & ~is_sky
-        confidence = torch.where(is_discarded, 1 - confidence, confidence)
+        confidence = torch.where(
+            is_discarded, torch.minimum(confidence, 1 - confidence), confidence
+        )
     return replace(match, confidence=confidence, is_sky=is_sky)
 
 

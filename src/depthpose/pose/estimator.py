@@ -23,7 +23,7 @@ from depthpose.core.stopwatch import Stopwatch
 from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, add_background
 from depthpose.pose.color_inputs import add_color
-from depthpose.pose.config import EstimateConfig
+from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.datasets.detections import Box, Detection, mask_view
 from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.inputs import (
@@ -38,7 +38,7 @@ from depthpose.pose.inputs import (
     view_input,
 )
 from depthpose.pose.pipeline import register
-from depthpose.pose.refusals import answer, unreadable_on_error
+from depthpose.pose.refusals import estimate_or_refusal, unreadable_on_error
 from depthpose.pose.search import Instances, SearchTargets, find_objects
 from depthpose.pose.track import track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
@@ -55,6 +55,7 @@ class PoseEstimator:
     Args:
         models: the objects.
         config: ICP, limits, device.
+        refusal: the limits of the weights, which hold where ``config`` has none.
     """
 
     holder: ClassVar = "weights"
@@ -64,8 +65,15 @@ class PoseEstimator:
     expects_all: ClassVar = False
     """Whether every object is expected in every image, as that of a CAD file is."""
 
-    def __init__(self, models: Sequence[ObjectModel], config: EstimateConfig | None) -> None:
+    def __init__(
+        self,
+        models: Sequence[ObjectModel],
+        config: EstimateConfig | None,
+        refusal: RefusalConfig | None = None,
+    ) -> None:
         self.config = EstimateConfig() if config is None else config
+        if self.config.refusal is None:
+            self.config = replace(self.config, refusal=refusal)
         self.models = tuple(models)
         self.objects = tuple(model.name for model in models)
         """Names of the objects."""
@@ -140,7 +148,7 @@ class PoseEstimator:
         known = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
         work = partial(register, pose_input, known, self.config, watch)
-        estimate = answer(pose_input, watch, work)
+        estimate = estimate_or_refusal(pose_input, watch, work)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
 
@@ -326,6 +334,13 @@ class PoseEstimator:
             raise InputError("find: objects names none; give those that may be there, or omit it")
         if isinstance(depth, ViewInput):
             view = depth
+            of_image = {"camera": camera, "unit": unit, "background": background}
+            unused = [f"{name}=" for name, value in of_image.items() if value is not None]
+            if unused:
+                raise InputError(
+                    f"find: {', '.join(unused)} belong to a depth image, and a view has its own; "
+                    "omit them"
+                )
         else:
             # A view names one object, which a search does not read.
             view = view_input(depth, None, camera, names[0], _NAME, unit)
@@ -400,6 +415,10 @@ class PoseEstimator:
         @torch.no_grad()
         def search(pose_input: AnyInput) -> PoseEstimate:
             """Pose the object in a frame without a pose of the frame before."""
+            if self.needs_mask:
+                return PoseEstimate(
+                    name=pose_input.name, object=which, status="no pose found", reason=NEEDS_MASK
+                )
             if isinstance(pose_input, CloudInput):
                 return self._estimate(pose_input, is_expected=False)
             return find_objects(pose_input, self._targets([which], "one at most"))[0]

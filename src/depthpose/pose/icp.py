@@ -478,8 +478,8 @@ def _gauss_newton(
             least = -_SLACK * distance if distance > target.ball[3] else -np.inf
             match(queries, target, eye, least, limit, is_exact, places)
 
-        # Linearise about the middle of the cloud: a rotation by w about the camera, D away, with
-        # the shift that cancels it to first order would leave the object w^2 D / 2 off.
+        # Linearise about the middle of the cloud. About the camera, at a distance D, rotation and
+        # shift nearly cancel, and what linearising leaves out is an error of w^2 D / 2.
         _linearise(local, eye, places, R, t - middle, limit, target, is_along_rays, residuals)
         H, b = build_normal_equations(residuals, _LEAST_INFORMATION)
         if step == last or has_converged:

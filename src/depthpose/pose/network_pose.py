@@ -33,7 +33,7 @@ from depthpose.pose.icp import refine_best, rotate_starts
 from depthpose.pose.networks.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
 from depthpose.pose.pipeline import judge, propose_by_pairs
 from depthpose.pose.propose import fit_poses, meet_lines, vote_ransac
-from depthpose.pose.refusals import Refused, answer, unreadable_on_error
+from depthpose.pose.refusals import Refused, estimate_or_refusal, unreadable_on_error
 from depthpose.pose.types import (
     AnyInput,
     PoseEstimate,
@@ -59,7 +59,7 @@ class VotingDirections(NamedTuple):
 
 
 @dataclass(kw_only=True, eq=False)
-class CloudToPose:
+class CloudJob:
     """A cloud that is prepared for the network, and then its directions."""
 
     pose_input: AnyInput  #: from which the cloud is lifted
@@ -73,16 +73,16 @@ class CloudToPose:
 
 
 def _group_by_voxels(
-    clouds: Iterable[CloudToPose | PoseEstimate], most: int
-) -> Iterator[list[CloudToPose | PoseEstimate]]:
+    clouds: Iterable[CloudJob | PoseEstimate], most: int
+) -> Iterator[list[CloudJob | PoseEstimate]]:
     """Group clouds, in their order, so that each group has ``most`` voxels at most or is one cloud.
 
     Estimates, of inputs that need no network, count as clouds without voxels.
     """
-    group: list[CloudToPose | PoseEstimate] = []
+    group: list[CloudJob | PoseEstimate] = []
     group_voxels = 0
     for item in clouds:
-        voxels = len(item.voxels.points_m) if isinstance(item, CloudToPose) else 0
+        voxels = len(item.voxels.points_m) if isinstance(item, CloudJob) else 0
         if group and group_voxels + voxels > most:
             yield group
             group = []
@@ -115,10 +115,7 @@ class GeoPoseNet(PoseEstimator):
     """By which the weights were loaded; empty where they came from memory."""
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        config = EstimateConfig() if config is None else config
-        if config.refusal is None:
-            config = replace(config, refusal=weights.refusal)
-        super().__init__(weights.models, config)
+        super().__init__(weights.models, config, weights.refusal)
         self.weights = weights
         self.terms = weights.facts.get("terms", "")
         """Terms of the weights that bind whoever uses them; empty without any."""
@@ -173,11 +170,11 @@ class GeoPoseNet(PoseEstimator):
         network's sums.
         """
 
-        def prepare(pose_input: AnyInput) -> CloudToPose | PoseEstimate:
+        def prepare(pose_input: AnyInput) -> CloudJob | PoseEstimate:
             """Prepare the cloud of one input."""
             return unreadable_on_error(pose_input, partial(self._prepare, pose_input))
 
-        def pose(job: CloudToPose | PoseEstimate) -> PoseEstimate:
+        def pose(job: CloudJob | PoseEstimate) -> PoseEstimate:
             """Pose one cloud."""
             if isinstance(job, PoseEstimate):
                 return job
@@ -193,7 +190,7 @@ class GeoPoseNet(PoseEstimator):
     def estimate_with_votes(
         self, pose_input: AnyInput
     ) -> tuple[PoseEstimate, VotingDirections | None]:
-        """Estimate one pose by the network alone, and return the directions that voted for it.
+        """Estimate one pose without registering it, and return the directions that voted for it.
 
         Returns:
             The estimate, and the points that vote with their directions in the camera frame; None
@@ -207,12 +204,14 @@ class GeoPoseNet(PoseEstimator):
             if isinstance(job, PoseEstimate):
                 return job, None
             self._run_network([job])
-            voted = answer(pose_input, job.watch, partial(self._estimate_by_votes, job))
+            voted = estimate_or_refusal(
+                pose_input, job.watch, partial(self._estimate_by_votes, job)
+            )
             return voted, VotingDirections(job.voxels.points_m, job.directions)
 
     def _prepare(
         self, pose_input: AnyInput, *, is_expected: bool = True
-    ) -> CloudToPose | PoseEstimate:
+    ) -> CloudJob | PoseEstimate:
         """Lift an input to the cloud and the voxels that the network takes.
 
         For a region, or an input that is refused, the finished estimate is returned instead.
@@ -222,13 +221,13 @@ class GeoPoseNet(PoseEstimator):
         known = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
 
-        def lift() -> CloudToPose:
+        def lift() -> CloudJob:
             """Lift it to the points of the object, and these to voxels."""
             with watch.stage("cloud"):
                 cloud = prepare_cloud(pose_input, known.model, self.weights.cloud, self.config)
                 seed = self.config.voting.seed
                 voxels = sample_and_voxelise(cloud.cloud_m, self.weights.cloud, seed)
-            return CloudToPose(
+            return CloudJob(
                 pose_input=pose_input,
                 known=known,
                 cloud=cloud,
@@ -237,11 +236,11 @@ class GeoPoseNet(PoseEstimator):
                 is_expected=is_expected,
             )
 
-        return answer(pose_input, watch, lift)
+        return estimate_or_refusal(pose_input, watch, lift)
 
-    def _run_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
+    def _run_network(self, group: Sequence[CloudJob | PoseEstimate]) -> None:
         """Run the network once on all clouds of a group, and set their ``directions``."""
-        jobs = [item for item in group if isinstance(item, CloudToPose)]
+        jobs = [item for item in group if isinstance(item, CloudJob)]
         if not jobs:
             return
         watch = Stopwatch()
@@ -267,7 +266,7 @@ class GeoPoseNet(PoseEstimator):
             job.directions = directions @ job.voxels.grid_from_camera
             job.watch.seconds["network"] = watch.seconds["network"] * count / sum(counts)
 
-    def _pose_or_register(self, job: CloudToPose | PoseEstimate) -> PoseEstimate:
+    def _pose_or_register(self, job: CloudJob | PoseEstimate) -> PoseEstimate:
         """Pose a cloud by its votes, or by registration where these are doubted.
 
         It is registered if the config says so and the input is expected to show its object. An
@@ -275,17 +274,20 @@ class GeoPoseNet(PoseEstimator):
         """
         if isinstance(job, PoseEstimate):
             return job
-        voted = answer(job.pose_input, job.watch, partial(self._estimate_by_votes, job))
+        voted = estimate_or_refusal(
+            job.pose_input, job.watch, partial(self._estimate_by_votes, job)
+        )
         may_register = self.config.register_refused and job.is_expected
         if not may_register or voted.status not in _DOUBTED:
             return voted
         watch = Stopwatch()
         with watch.stage("registration"):
-            registered = self._register_or_search(job.pose_input)
+            work = partial(self._register_or_search, job.pose_input)
+            registered = unreadable_on_error(job.pose_input, work)
         best = registered if registered.is_posed else voted
         return replace(best, seconds={**voted.seconds, **watch.seconds})
 
-    def _estimate_by_votes(self, job: CloudToPose) -> PoseEstimate:
+    def _estimate_by_votes(self, job: CloudJob) -> PoseEstimate:
         """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence.
 
         Args:
@@ -344,7 +346,7 @@ class GeoPoseNet(PoseEstimator):
             raise Refused(refused.status, refused.reason, **measured) from refused
         return replace(estimate, **voted)
 
-    def _vote(self, job: CloudToPose) -> Vote:
+    def _vote(self, job: CloudJob) -> Vote:
         """Find the keypoints, in the camera frame, where the directions at the points meet."""
         points_m = job.voxels.points_m.double()
         directions = job.directions.double()
@@ -353,7 +355,7 @@ class GeoPoseNet(PoseEstimator):
             return vote_ransac(points_m, directions, config=voting)
         return meet_lines(points_m, directions, refinements=voting.refinements)
 
-    def _measure_disagreement(self, job: CloudToPose, pose: Rigid) -> float:
+    def _measure_disagreement(self, job: CloudJob, pose: Rigid) -> float:
         """Measure the mean angle [rad] between the directions and those to a pose's keypoints.
 
         The network was trained to treat symmetric copies of a pose as one: the angle is measured to
@@ -391,7 +393,7 @@ class DepthImageRegressor(PoseEstimator):
     needs_mask = True
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        super().__init__(weights.models, config)
+        super().__init__(weights.models, config, weights.refusal)
         if not isinstance(weights.network, DepthImageNet):
             raise InputError(
                 "these weights cast votes and regress no depth image; load them as GeoPoseNet"
@@ -418,7 +420,7 @@ class DepthImageRegressor(PoseEstimator):
         _ = known.surface  # computed before any stage is timed
         watch = Stopwatch()
         work = partial(self._regress, pose_input, known, watch)
-        return answer(pose_input, watch, work)
+        return estimate_or_refusal(pose_input, watch, work)
 
     def _regress(self, pose_input: ViewInput, known: KnownObject, watch: Stopwatch) -> PoseEstimate:
         """Regress the pose of one object, and refine it.

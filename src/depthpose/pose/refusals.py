@@ -27,7 +27,7 @@ class Refused(Exception):  # noqa: N818  an answer, and no error of the caller's
         self.measured = measured
 
 
-def answer(
+def estimate_or_refusal(
     pose_input: AnyInput, watch: Stopwatch, work: Callable[[], Result]
 ) -> Result | PoseEstimate:
     """Do work on an input; where it is :class:`Refused`, return the estimate that says so.

@@ -38,7 +38,7 @@ from depthpose.pose.inliers import frame_inliers, share_in_background
 from depthpose.pose.picking import rank_picks
 from depthpose.pose.pipeline import register
 from depthpose.pose.propose.image import propose_in_frame
-from depthpose.pose.refusals import answer
+from depthpose.pose.refusals import estimate_or_refusal
 from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
 from depthpose.pose.verify.decide import (
     LEAST_SHARE,
@@ -136,7 +136,7 @@ class Candidate:
 
 
 def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
-    """Pose every known object that a depth image shows, the surest first; refuse the others.
+    """Pose every known object that a depth image shows, by their evidence; refuse the others.
 
     Where poses of several objects explain the same readings, they share the probability of one, and
     where none has most of it none is reported. Where an object is there more than once, the rest of
@@ -157,26 +157,27 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     region = crop_to_region(view)
     smallest_m = min(target.surface.diameter_m for target in targets.objects.values())
     frame = prepare_frame(region.depth_m, region.K, smallest_m, region.background)
-    is_unclaimed = region.mask[:: frame.step, :: frame.step].clone()
+    is_searched = region.mask[:: frame.step, :: frame.step].clone()
 
     names = list(targets.objects)
     examined: list[Candidate] = []  # what each stage makes of them
     claimed: list[Candidate] = []  # found, or of one of several objects
     found: list[Candidate] = []
     for _ in range(1 if targets.is_single else _ROUNDS):
-        proposed = _propose(frame, is_unclaimed, names, claimed, targets)
+        proposed = _propose(frame, is_searched, names, claimed, targets)
         refined = _refine(proposed, frame, region, targets)
-        registered = _register(_group(refined), frame, region, is_unclaimed, targets)
-        maxima = _suppress(registered, claimed)
+        registered = _register(_group(refined), frame, region, is_searched, targets)
+        maxima, suppressed = _suppress(registered, claimed)
         answered = _weigh_objects(maxima, registered)
-        examined += [*refined, *registered, *maxima, *answered]
+        examined += [*refined, *registered, *suppressed, *answered]
 
-        # The likeliest claim their inliers, though it may be open which object they show.
-        claimed += _remaining(maxima)
+        # No later candidate may lie where a maximum lies, though it may be open which object it
+        # shows; the inliers of what is found are not even searched again.
+        claimed += maxima
         new = _remaining(answered)
         found += new
         for candidate in new:
-            is_unclaimed &= ~candidate.inliers
+            is_searched &= ~candidate.inliers
 
         # What is there twice may be there more often; what is there once is not looked for again.
         count = Counter(candidate.object for candidate in found)
@@ -187,25 +188,32 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     weighed = _weigh_instances(found, targets)
     examined += weighed
 
-    # An estimate of each instance, and for each object without one a refusal.
     spent_s = time.perf_counter() - began
-    estimates: list[PoseEstimate] = []
-    for candidate in _rank(weighed):
-        assert candidate.estimate is not None, "what is found was registered"
-        estimate = with_status(candidate.estimate, targets.config.min_certainty)
-        estimates.append(replace(estimate, seconds={**estimate.seconds, "search": spent_s}))
-    if not targets.is_single:
-        surfaces = {name: target.surface for name, target in targets.objects.items()}
-        estimates = rank_picks(estimates, region, surfaces)
-    found_names = {candidate.object for candidate in _remaining(weighed)}
+    estimates = _answer_instances(weighed, region, targets, spent_s)
+    missing = set(targets.objects) - {candidate.object for candidate in _remaining(weighed)}
     rejected = [candidate for candidate in examined if candidate.rejected]
     for name in targets.objects:
-        if name not in found_names:
+        if name in missing:
             misses = [candidate for candidate in rejected if candidate.object == name]
             estimates.append(nothing_found(view, name, misses, spent_s))
     if len(estimates) == 1:
         return [replace(estimates[0], name=view.name)]
     return [replace(estimate, name=f"{view.name}_{k}") for k, estimate in enumerate(estimates)]
+
+
+def _answer_instances(
+    weighed: Sequence[Candidate], view: ViewInput, targets: SearchTargets, spent_s: float
+) -> list[PoseEstimate]:
+    """Make the estimate of each instance, the surest first, and rank them for picking."""
+    estimates: list[PoseEstimate] = []
+    for candidate in _rank(weighed):
+        assert candidate.estimate is not None, "what is found was registered"
+        estimate = with_status(candidate.estimate, targets.config.min_certainty)
+        estimates.append(replace(estimate, seconds={**estimate.seconds, "search": spent_s}))
+    if targets.is_single:
+        return estimates
+    surfaces = {name: target.surface for name, target in targets.objects.items()}
+    return rank_picks(estimates, view, surfaces)
 
 
 def _remaining(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -215,7 +223,7 @@ def _remaining(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 def _propose(
     frame: Frame,
-    is_unclaimed: Bool[Tensor, "h w"],
+    is_searched: Bool[Tensor, "h w"],
     names: Sequence[str],
     claimed: Sequence[Candidate],
     targets: SearchTargets,
@@ -225,7 +233,7 @@ def _propose(
     def propose_object(name: str) -> list[tuple[float, str, Rigid]]:
         """Propose poses of one object: their scores, the best first, its name, and the poses."""
         pairs = targets.objects[name].pairs
-        poses, scores = propose_in_frame(frame, is_unclaimed, pairs, len(names))
+        poses, scores = propose_in_frame(frame, is_searched, pairs, len(names))
         best = scores.tolist()[:_MOST_PROPOSALS]
         return [(score, name, poses[k]) for k, score in enumerate(best)]
 
@@ -328,12 +336,12 @@ def _register(
     groups: Sequence[Sequence[Candidate]],
     frame: Frame,
     view: ViewInput,
-    is_region: Bool[Tensor, "h w"],
+    is_searched: Bool[Tensor, "h w"],
     targets: SearchTargets,
 ) -> list[Candidate]:
     """Register the object of each group, from all its poses, to the inliers of its leader.
 
-    ``is_region``: the readings among which the object is, where one instance is expected.
+    ``is_searched``: the readings among which the object is, where one instance is expected.
     """
 
     def register_group(numbered: tuple[int, Sequence[Candidate]]) -> PoseEstimate:
@@ -357,11 +365,11 @@ def _register(
             proposals=Rigid.stack([candidate.pose for candidate in group]),
             is_expected=targets.is_expected,
         )
-        return answer(cloud, watch, work)
+        return estimate_or_refusal(cloud, watch, work)
 
     estimates = map_in_threads(register_group, enumerate(groups), torch.get_num_threads())
     return [
-        _take_estimate(group[0], estimate, frame, is_region, targets)
+        _take_estimate(group[0], estimate, frame, is_searched, targets)
         for estimate, group in zip(estimates, groups, strict=True)
     ]
 
@@ -370,7 +378,7 @@ def _take_estimate(
     candidate: Candidate,
     estimate: PoseEstimate,
     frame: Frame,
-    is_region: Bool[Tensor, "h w"],
+    is_searched: Bool[Tensor, "h w"],
     targets: SearchTargets,
 ) -> Candidate:
     """Give a candidate its estimate; reject what is refused, or lies where no object can be."""
@@ -390,18 +398,20 @@ def _take_estimate(
 
     # The only instance lies in the region that was given.
     posed = replace(_move(candidate, pose, evidence, frame, targets), estimate=estimate)
-    inside_share = float(is_region[posed.inliers].double().mean())
+    inside_share = float(is_searched[posed.inliers].double().mean())
     if targets.is_single and not inside_share > _LEAST_INSIDE:  # without inliers it is NaN
         return replace(posed, rejected="most of it lies outside the given region")
     return posed
 
 
-def _suppress(candidates: Sequence[Candidate], claimed: Sequence[Candidate]) -> list[Candidate]:
+def _suppress(
+    candidates: Sequence[Candidate], claimed: Sequence[Candidate]
+) -> tuple[list[Candidate], list[Candidate]]:
     """Suppress each candidate that overlaps a likelier one, or one that has claimed its inliers.
 
     Returns:
-        The maxima, which nothing suppresses; and, rejected, those that another object suppresses.
-        What is suppressed by its own object is the same instance, and left out.
+        The maxima, which nothing suppresses; and the candidates that another object suppresses,
+        rejected. What is suppressed by its own object is the same instance, and left out.
     """
     maxima: list[Candidate] = []
     suppressed: list[Candidate] = []
@@ -414,14 +424,14 @@ def _suppress(candidates: Sequence[Candidate], claimed: Sequence[Candidate]) -> 
         elif suppressor.object != candidate.object:
             reason = f"what lies there is more likely {suppressor.object}"
             suppressed.append(replace(candidate, rejected=reason))
-    return [*maxima, *suppressed]
+    return maxima, suppressed
 
 
 def _weigh_objects(maxima: Sequence[Candidate], candidates: Sequence[Candidate]) -> list[Candidate]:
     """Weigh each maximum by its rivals, the other objects at its place, one of which is there.
 
     Args:
-        maxima: what suppression leaves of the candidates.
+        maxima: those that nothing suppresses.
         candidates: all that were registered, which the rivals are taken from.
 
     Returns:
@@ -429,9 +439,9 @@ def _weigh_objects(maxima: Sequence[Candidate], candidates: Sequence[Candidate])
     """
     ranked = _rank(candidates)
     weighed: list[Candidate] = []
-    for candidate in _remaining(maxima):
-        # The likeliest of each other object. What is likelier than a maximum and suppressed is of
-        # another place.
+    for candidate in maxima:
+        # The likeliest of each other object. Likelier rivals, which another maximum suppressed, do
+        # not count.
         rivals = {candidate.object: candidate}
         for other in ranked[ranked.index(candidate) + 1 :]:
             if candidate.overlap(other) > _SAME_PLACE:
@@ -500,7 +510,7 @@ def nothing_found(
         nearest = max(rejected, key=lambda candidate: candidate.agreement)
         x, y, z = nearest.middle_m.tolist()
         reason += (
-            f". Of {len(rejected)} places that were compared the nearest miss, at ({x:.3f}, "
+            f". Of {len(rejected)} poses that were compared the nearest miss, at ({x:.3f}, "
             f"{y:.3f}, {z:.3f}) m: {nearest.rejected}"
         )
     return PoseEstimate(status="doubtful", reason=reason, **facts)

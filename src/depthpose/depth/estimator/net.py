@@ -346,8 +346,8 @@ class FakestereoNet:
             camera: camera of the pictures, as for :meth:`estimate`; inputs have their own.
             focal_px: the focal length alone [px], in place of ``camera``.
             fov_deg: the horizontal field of view alone [degrees], in place of both.
-            batch: how many successive images of one size go through the networks together: more
-                are faster on a GPU, slower on a processor.
+            batch: how many successive images of one size go through the generator together: more
+                are faster on a GPU, slower on a processor. Pairs are matched one by one.
             threads: how many batches run at the same time, in as many times the memory.
             with_progress: show a bar on the terminal.
 

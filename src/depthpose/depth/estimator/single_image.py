@@ -147,11 +147,20 @@ def _match_views(
     ]
     if views.matches is None:
         return matches
-    # The generator knows the sky.
     return [
-        replace(match, is_sky=by_generator.is_sky)
+        _take_sky(match, by_generator)
         for match, by_generator in zip(matches, views.matches, strict=True)
     ]
+
+
+def _take_sky(match: Match, by_generator: Match) -> Match:
+    """Take the sky, with the confidence there, from the generator, which knows it."""
+    is_sky = by_generator.is_sky
+    assert is_sky is not None
+    confidence = match.confidence
+    if confidence is not None and by_generator.confidence is not None:
+        confidence = torch.where(is_sky, by_generator.confidence, confidence)
+    return replace(match, is_sky=is_sky, confidence=confidence)
 
 
 def _check_in_distribution(

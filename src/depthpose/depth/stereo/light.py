@@ -296,6 +296,7 @@ class LightMatcher(NetworkMatcher):
     It measures where the disparities of a pair lie, and searches there.
     """
 
+    takes_largest_disparity = True
     fine_pixels = 650_000
     """Pixels of a fine match at most: an image of KITTI, enlarged 1.18 times."""
     largest_upscale = 1.5

@@ -75,9 +75,12 @@ class NetworkMatcher(ABC):
         config: how it is run; None: the defaults.
 
     Raises:
-        InputError: the device does not exist on this machine.
+        InputError: the device does not exist on this machine; a largest disparity for a network
+            that searches those of its training alone.
     """
 
+    takes_largest_disparity: ClassVar[bool] = False
+    """Whether ``max_disparity_px`` of the config may bound the search."""
     fine_pixels: ClassVar[int]
     """Most pixels of an image that is matched at the speed ``fine``."""
     largest_upscale: ClassVar[float] = 1.0
@@ -90,6 +93,12 @@ class NetworkMatcher(ABC):
 
     def __init__(self, network: StereoNetwork, config: MatcherConfig | None = None) -> None:
         config = config or MatcherConfig()
+        if config.max_disparity_px is not None and not self.takes_largest_disparity:
+            raise InputError(
+                f"max_disparity_px is {config.max_disparity_px:g}, but this network searches the "
+                f"{network.config.max_disparity_px} disparities that it was trained with; omit it "
+                "(--max-disparity), or take weights with a light matcher, as 'default'"
+            )
         self.device = usable_device(config.device)
         precision = usable_precision(config.precision, config.device)
         self.config = replace(config, precision=precision)

@@ -23,7 +23,7 @@ from depthpose.core.checkpoint import (
 )
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig, PSMNetConfig
+from depthpose.depth.config import PSMNetConfig
 from depthpose.depth.stereo import layers
 from depthpose.depth.stereo.layers import ConvNorm, Volume
 from depthpose.depth.stereo.network_matcher import (
@@ -373,15 +373,6 @@ class PSMNetMatcher(NetworkMatcher):
     fine_pixels = 280_000
     """Pixels of a fine match at most: an image of KITTI at three quarters of its resolution."""
     activation_bytes = staticmethod(psmnet_bytes)
-
-    def __init__(self, network: PSMNet, config: MatcherConfig | None = None) -> None:
-        if config is not None and config.max_disparity_px is not None:
-            raise InputError(
-                f"max_disparity_px is {config.max_disparity_px:g}, but this network searches the "
-                f"{network.config.max_disparity_px} disparities that it was trained with; omit it "
-                "(--max-disparity), or take weights with a light matcher, as 'default'"
-            )
-        super().__init__(network, config)
 
     def fold(self, network: PSMNet, example: Tensor) -> PSMNet:
         """Keep the last convolution of each head in float32, fold the batch norms of the rest.

@@ -47,7 +47,8 @@ class DisparityRange:
     step_px: float  #: error of both ends, by which they are set outwards
     left_px: Map  #: disparity of the left view in the narrow copy
     right_px: Map  #: disparity of the right view in the narrow copy
-    is_sure: Mask  #: left pixels whose disparity in the copy is no guess, however near it is
+    #: left pixels that the right view shows, not blank, with a confidence of 0.5 at least
+    is_sure: Mask
 
 
 def measure_disparity_range(

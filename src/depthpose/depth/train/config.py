@@ -151,7 +151,8 @@ class StereoTraining(TrainingConfig):
     """The network that is trained, by its name in ``depth.weights.MATCHERS``: psmnet, light."""
 
     network: dict[str, object] = field(default_factory=dict)
-    """Settings of the network, those of the config of its kind; others have their defaults."""
+    """Settings of the network, those of the config of its kind; others have their defaults, which
+    are filled in. To take another kind, give both anew."""
 
     start: str | None = None
     """Weights of the whole network to begin with (or a whole set)."""

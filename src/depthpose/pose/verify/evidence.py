@@ -7,7 +7,7 @@ contradicts the pose, however small its share of the whole: behind the drawn sur
 through it (a free-space violation), before it the object bulges where the model does not, and the
 object's own readings beside the drawn silhouette are not explained at all. Where no mask says which
 readings are the object's, a surface that goes on across the silhouette, straight or bent away as
-round a corner of one body, does not end there.
+round a corner of one body, contradicts the pose too: it lies on something larger.
 """
 
 import math

@@ -83,7 +83,7 @@ def compete(
     Args:
         cloud_m: points of the object, in the camera frame.
         refined: the leading pose.
-        others: at which refinement ended elsewhere.
+        others: further poses, refined or only proposed.
         known: the object.
         observation: of it.
         config: of the refinement; without ICP poses stay where they are.
@@ -98,7 +98,7 @@ def compete(
     different_fits = _refine_different_poses(cloud_m, refined, others, known, config)
     different = [hypothesize(fit) for fit in different_fits]
     if view is not None:
-        different = _with_color_of_best_copy(different, known, view)
+        different = _merge_by_colored_copy(different, known, view)
     shares = share_among_poses(different, is_masked=is_masked)
     winner = different[int(shares.argmax())]
 
@@ -337,12 +337,13 @@ def _measure_twist(R: Float64[Tensor, "3 3"], axis: Float64[Tensor, "3"]) -> Flo
     return 2 * torch.atan2(axial @ axis, 1 + R.trace())
 
 
-def _with_color_of_best_copy(
+def _merge_by_colored_copy(
     hypotheses: Sequence[Hypothesis], known: KnownObject, view: ViewInput
 ) -> list[Hypothesis]:
-    """Return poses with the colour evidence of their best copies: each stands for all of them.
+    """Merge poses that are copies of each other, with the colour evidence of their best copies.
 
-    Poses whose best copies are one pose are copies of each other: the first stands for them.
+    Each pose stands for all of its copies. Poses whose best copies by colour are one pose are
+    copies of each other: the first stands for them.
     """
     copies = known.copies
     symmetries = _all_symmetries(known)

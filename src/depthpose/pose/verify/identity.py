@@ -288,8 +288,8 @@ def measure_distance(
 def measure_mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
     """Measure how much nearer a cloud lies to the mirror image of the model, in its best pose.
 
-    The cloud is mirrored in place of the model, so that ICP finds a pose. Its distances are those
-    of :func:`measure_scale`, not a user's: the gains that decide were measured with them.
+    The cloud is mirrored in place of the model, so that ICP finds a pose. The distances of ICP are
+    fixed, as in :func:`measure_scale`: the gains that decide were measured with them.
 
     Returns:
         The gain in root mean square distance, in limits of nearness; negative where the mirror

@@ -184,7 +184,8 @@ def probability_of_instances(
     prior_many = 0.0 if is_single else PRIOR_MANY
     by_itself = log_odds.sigmoid()
     log_weights_none_or_one = torch.cat([log_odds.new_zeros(1), log_odds])
-    # Of any number of instances every choice of places is possible.
+    # Weights relative to no instance: of one of them the sum of the odds; of any subset of the
+    # places the prior times the product of 1 + odds.
     log_weight_many = log_odds.new_tensor(prior_many).log() + softplus(log_odds).sum()
     probability_many = (log_weight_many - log_weights_none_or_one.logsumexp(0)).sigmoid()
     return (
