@@ -30,7 +30,7 @@ POSE = {
 NETWORK = {"norm": "none", "first_kernel": 3, "encoder": [4, 4, 8, 8], "decoder": [4, 4, 4, 8]}
 CONFIGS = {
     "depth/view": {"generator": GENERATOR, "discriminator_width": 4, "pairs": PAIRS, "loop": LOOP},
-    "depth/stereo": {"matcher": MATCHER, "pairs": PAIRS, "loop": LOOP},
+    "depth/stereo": {"network": MATCHER, "pairs": PAIRS, "loop": LOOP},
     "depth/finetune": {"pairs": PAIRS, "loop": LOOP},
     "pose/thesis": POSE | {"network": NETWORK},
     "pose/thesis-pointnet": POSE

@@ -329,7 +329,7 @@ def rotate_starts(poses: Rigid, surface: Surface, starts: int) -> Rigid:
             the camera, then the other way.
 
     Returns:
-        The rotated poses, without the given ones: those of the first rotation first.
+        The rotated poses, those of the first rotation first; the given ones are not among them.
     """
     eye = torch.eye(3, dtype=torch.float64)
     axes = torch.cat([eye, -eye])[: starts - 1]
