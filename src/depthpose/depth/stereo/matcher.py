@@ -6,7 +6,7 @@ These begin at a disparity of 0, so views are moved until that is infinitely far
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from depthpose.depth.types import Map, Match, View
 _SLACK = 1e-3  # by which rounding may put a value of an image beyond [0, 1]
 
 
+@runtime_checkable
 class Matcher(Protocol):
     """Anything that estimates the disparity of the left image of a rectified pair."""
 
