@@ -105,7 +105,8 @@ class ViewInput:
     name: str  #: of the input, its results and their files
     #: along the optical axis; NaN where there is no reading. May be a window of a larger image.
     depth_m: Float[Tensor, "h w"]
-    mask: Bool[Tensor, "mask_h mask_w"]  #: the object's pixels, as a segmentation gives them, with errors
+    #: the object's pixels, as a segmentation gives them, with errors
+    mask: Bool[Tensor, "mask_h mask_w"]
     K: Float[Tensor, "3 3"]  #: intrinsic matrix of this image (a window shifts the principal point)
     object: str  # name of the object
     color: ColorImage | None = None  #: of the same moment; None: depth alone
