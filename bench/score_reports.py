@@ -77,7 +77,8 @@ def pose_case(home: Path, case: Case) -> list[Row]:
     def search() -> list[PoseEstimate]:
         if case.with_mask:
             return [registration.estimate(depth=depth, mask=mask, camera=camera)]
-        return [found for found in registration.find(depth, camera) if found.is_posed]
+        answers = registration.find(depth, camera)
+        return [estimate for estimate in answers if estimate.is_posed]
 
     estimates, cpu_s = with_cpu_seconds(search)
     if not estimates:  # though the part is in full view

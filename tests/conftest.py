@@ -70,7 +70,7 @@ def _content(value: object) -> object:
 def prepared_once() -> Iterator[None]:
     """What an estimator computes of a shape, and Git's answer, is computed once a process."""
     from depthpose.core import environment
-    from depthpose.pose.verify import known_object
+    from depthpose.pose.verify import target_object
 
     made: dict[object, Any] = {}
 
@@ -84,9 +84,9 @@ def prepared_once() -> Iterator[None]:
         return give
 
     with pytest.MonkeyPatch.context() as patch:
-        surface = once(known_object.prepare_surface, lambda *given: _content(given))
-        patch.setattr(known_object, "prepare_surface", surface)
-        patch.setattr(known_object, "prepare_pairs", once(known_object.prepare_pairs, id))
+        surface = once(target_object.prepare_surface, lambda *given: _content(given))
+        patch.setattr(target_object, "prepare_surface", surface)
+        patch.setattr(target_object, "prepare_pairs", once(target_object.prepare_pairs, id))
         patch.setattr(environment, "_read_commit", cache(environment._read_commit))
         yield
 

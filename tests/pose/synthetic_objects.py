@@ -176,7 +176,7 @@ class Oracle(GeoPoseNet):
         ready = [one for one in group if isinstance(one, CloudJob)]
         self.calls += [len(ready)] if ready else []
         for one in ready:
-            one.directions = self._true(one.voxels.points_m, one.known.number)
+            one.directions = self._true(one.voxels.points_m, one.target.number)
             one.watch.seconds["network"] = 0.01
 
     def _true(self, points_m: Tensor, number: int) -> Tensor:

@@ -47,7 +47,7 @@ from depthpose.pose.types import ObjectModel, PoseFit, Symmetries, ViewInput
 from depthpose.pose.verify import hypotheses
 from depthpose.pose.verify.evidence import observe
 from depthpose.pose.verify.hypotheses import compete
-from depthpose.pose.verify.known_object import KnownObject
+from depthpose.pose.verify.target_object import TargetObject
 
 EYE = torch.eye(3, dtype=torch.float64)
 
@@ -141,21 +141,21 @@ def test_copies_of_a_plate_stay_where_its_symmetry_has_them(seed: int) -> None:
     depth_m = depth_m + 0.0012 * torch.randn(depth_m.shape, generator=noise)
     view = ViewInput(name="a", depth_m=depth_m.float(), mask=mask, K=K, object=plate.name)
     cloud_m = cloud_from_depth(view.depth_m, mask, K).double()
-    known = KnownObject(number=0, model=plate)
+    target = TargetObject(number=0, model=plate)
 
     leading = truth @ half_turn([1.0, 0.0, 0.0])
-    refined = refine_exactly(cloud_m, leading, known.surface, start_diameters=0.05)
-    observation = observe(cloud_m, view, known.surface, is_masked=True)
+    refined = refine_exactly(cloud_m, leading, target.surface, start_diameters=0.05)
+    observation = observe(cloud_m, view, target.surface, is_masked=True)
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
-    competition = compete(cloud_m, refined, none, known, observation, EstimateConfig())
+    competition = compete(cloud_m, refined, none, target, observation, EstimateConfig())
     poses = [competition.best.pose, *(copy.pose for copy, _ in competition.copies)]
     errors = [float(add_m(pose.float(), truth.float(), plate.vertices_m)) for pose in poses]
     assert min(errors) < 0.004
 
 
-def turned_about_near_axis(known: KnownObject, pose: Rigid, degrees: float) -> PoseFit:
+def turned_about_near_axis(target: TargetObject, pose: Rigid, degrees: float) -> PoseFit:
     """A pose after a rotation about the axis of the object's near-symmetric copies."""
-    axis = known.copies.near_axis
+    axis = target.copies.near_axis
     assert axis is not None
     angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
     turn = turn_about(axis.direction.double(), axis.point_m.double(), angle)
@@ -168,9 +168,9 @@ def turned_about_near_axis(known: KnownObject, pose: Rigid, degrees: float) -> P
 def test_a_copy_that_drifts_competes_where_it_began_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """One drifts onto the winner and one to another angle: each start stays, and the new angle."""
     mug = make_part("mug", 1)
-    known = KnownObject(number=0, model=mug)
+    target = TargetObject(number=0, model=mug)
     truth = pose_at(seed=1).double()
-    turned = partial(turned_about_near_axis, known, truth)
+    turned = partial(turned_about_near_axis, target, truth)
     competitors = [
         hypotheses._Competitor(refined=turned(0.0), unrefined=turned(60.0)),
         hypotheses._Competitor(refined=turned(150.0), unrefined=turned(120.0)),
@@ -178,7 +178,7 @@ def test_a_copy_that_drifts_competes_where_it_began_too(monkeypatch: pytest.Monk
     ]
     monkeypatch.setattr(hypotheses, "_refine_competitors", lambda *_: competitors)
     copies = hypotheses._refine_distinct_copies(
-        torch.zeros(1, 3).double(), turned(0.0), known, EstimateConfig(), None
+        torch.zeros(1, 3).double(), turned(0.0), target, EstimateConfig(), None
     )
     angles = [
         math.degrees(float(geodesic_rad(copy.camera_from_model.R, truth.R))) for copy in copies
@@ -191,9 +191,9 @@ def test_a_pose_that_is_one_of_the_copies_competes_with_none(
 ) -> None:
     """Between two copies about an axis lies no other pose: the group has its probability."""
     mug = make_part("mug", 1)
-    known = KnownObject(number=0, model=mug)
+    target = TargetObject(number=0, model=mug)
     truth = pose_at(seed=1).double()
-    turned = partial(turned_about_near_axis, known, truth)
+    turned = partial(turned_about_near_axis, target, truth)
 
     upside_down = rotation_by(torch.tensor([math.pi, 0.0, 0.0])).double()
     other = replace(turned(0), camera_from_model=Rigid(truth.R @ upside_down, truth.t_m))
@@ -201,9 +201,9 @@ def test_a_pose_that_is_one_of_the_copies_competes_with_none(
     monkeypatch.setattr(hypotheses, "_refine_different_poses", lambda *_: different)
     monkeypatch.setattr(hypotheses, "_refine_distinct_copies", lambda *_: [turned(49.5)])
     cloud_m = cloud_of(mug, truth.float()).double()
-    observation = observe(cloud_m, None, known.surface, is_masked=True)
+    observation = observe(cloud_m, None, target.surface, is_masked=True)
     competition = compete(
-        cloud_m, turned(0), Rigid.stack([truth]), known, observation, EstimateConfig()
+        cloud_m, turned(0), Rigid.stack([truth]), target, observation, EstimateConfig()
     )
     assert len(competition.others) == 1
     total = competition.group_share + competition.others[0][1]
@@ -229,12 +229,12 @@ def test_only_what_has_a_copy_is_less_certain_of_it() -> None:
 def test_a_copy_that_drifted_about_an_axis_is_put_back_to_its_angle_alone() -> None:
     """What refinement changed besides, here a shift, stays."""
     mug = make_part("mug", 1)
-    known = KnownObject(number=0, model=mug)
+    target = TargetObject(number=0, model=mug)
     shift = Rigid(torch.eye(3).double(), torch.tensor([0.0, 0.0, 0.004]).double())
-    turned = partial(turned_about_near_axis, known, pose_at(seed=1).double())
+    turned = partial(turned_about_near_axis, target, pose_at(seed=1).double())
     start, drifted = turned(30.0), turned(70.0)
     refined = replace(drifted, camera_from_model=shift @ drifted.camera_from_model)
-    undone = hypotheses._undo_drift(refined, start, known.copies.near_axis)
+    undone = hypotheses._undo_drift(refined, start, target.copies.near_axis)
     expected = (shift @ start.camera_from_model).matrix()
     torch.testing.assert_close(undone.camera_from_model.matrix(), expected, atol=1e-6, rtol=0)
     assert hypotheses._undo_drift(refined, start, None) is start

@@ -161,7 +161,7 @@ class Doubting(GeoPoseNet):
     """A network that takes none of its own answers."""
 
     def _estimate_by_votes(self, job: CloudJob) -> PoseEstimate:
-        raise Refused("doubtful", f"{job.known.model.name} is doubted")
+        raise Refused("doubtful", f"{job.target.model.name} is doubted")
 
 
 @cache

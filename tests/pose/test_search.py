@@ -39,7 +39,7 @@ from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import CloudInput, Evidence, ObjectModel, PoseEstimate
 from depthpose.pose.verify.copies import find_copies
 from depthpose.pose.verify.evidence import compare, observe
-from depthpose.pose.verify.known_object import KnownObject
+from depthpose.pose.verify.target_object import TargetObject
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 
@@ -316,19 +316,19 @@ def test_forty_models_take_bounded_time(net: Registration, monkeypatch: pytest.M
     registered = list[str]()
 
     def count(
-        cloud: CloudInput, known: KnownObject, config: EstimateConfig, watch: Stopwatch,
+        cloud: CloudInput, target: TargetObject, config: EstimateConfig, watch: Stopwatch,
         **options: Any,  # noqa: ANN401
     ) -> PoseEstimate:  # fmt: skip
         registered.append(cloud.name)
-        return register(cloud, known, config, watch, **options)
+        return register(cloud, target, config, watch, **options)
 
     monkeypatch.setattr(search, "register", count)
-    known = net._find_object("bracket").prepare()
-    objects: dict[str, KnownObject] = {}
+    target = net._find_object("bracket").prepare()
+    objects: dict[str, TargetObject] = {}
     for k in range(40):
-        model = replace(known.model, name=f"part {k}")
-        copy = KnownObject(number=k, model=model)
-        copy.surface, copy.copies, copy.pairs = known.surface, known.copies, known.pairs
+        model = replace(target.model, name=f"part {k}")
+        copy = TargetObject(number=k, model=model)
+        copy.surface, copy.copies, copy.pairs = target.surface, target.copies, target.pairs
         objects[model.name] = copy
     targets = replace(TARGETS, objects=objects)
     began = time.process_time()
@@ -362,7 +362,7 @@ def registered(
     )  # fmt: skip
 
 
-PREPARED = KnownObject(number=0, model=bracket())
+PREPARED = TargetObject(number=0, model=bracket())
 TARGETS = SearchTargets(
     objects={"a": PREPARED, "b": PREPARED, "c": PREPARED},
     config=EstimateConfig(),
@@ -506,11 +506,11 @@ def test_proposals_at_one_place_leave_room_for_others(
     net: Registration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sixty lie on a first part, and only then some on a second: these are looked at too."""
-    known = net._find_object("bracket").prepare()
+    target = net._find_object("bracket").prepare()
     truths = [pose_at(x_m).double() for x_m in (-0.15, 0.15)]
-    depth_m, _ = view_of(known.model, *(truth.float() for truth in truths))
+    depth_m, _ = view_of(target.model, *(truth.float() for truth in truths))
     view = view_input(depth_m.float(), None, CAMERA, "bracket", "x", None)
-    frame = prepare_frame(view.depth_m, view.K, known.surface.diameter_m)
+    frame = prepare_frame(view.depth_m, view.K, target.surface.diameter_m)
     first, second = truths
     names = ["a", "b"]
 
@@ -518,7 +518,7 @@ def test_proposals_at_one_place_leave_room_for_others(
         return Rigid.stack([first] * 30 + [second] * 3), torch.linspace(1.0, 0.5, 33)
 
     monkeypatch.setattr(search, "propose_in_frame", propose)
-    targets = replace(TARGETS, objects=dict.fromkeys(names, known))
+    targets = replace(TARGETS, objects=dict.fromkeys(names, target))
     everywhere = torch.ones_like(frame.depth_m, dtype=torch.bool)
     candidates = search._propose(frame, everywhere, names, [], targets)
     at_first = [one for one in candidates if torch.equal(one.pose.t_m, first.t_m)]
@@ -531,15 +531,15 @@ def test_the_best_evidence_leads_a_place_not_the_first_proposal(
     net: Registration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each proposal is refined on what it explains: a coarse right one passes a wrong one."""
-    known = net._find_object("bracket").prepare()
+    target = net._find_object("bracket").prepare()
     truth = pose_at()
-    depth_m, _ = view_of(known.model, truth)
+    depth_m, _ = view_of(target.model, truth)
     view = view_input(depth_m.float(), None, CAMERA, "bracket", "x", None)
-    frame = prepare_frame(view.depth_m, view.K, known.surface.diameter_m)
+    frame = prepare_frame(view.depth_m, view.K, target.surface.diameter_m)
     half_turn = rotation_by(torch.tensor([0.0, 0.0, math.pi]).double())
     coarse = Rigid(truth.R.double(), truth.t_m.double() + torch.tensor([0.002, 0.001, 0.003]))
     wrong = Rigid(truth.R.double() @ half_turn, coarse.t_m)
-    surface = known.surface
+    surface = target.surface
     candidates = [
         search.Candidate(
             object="bracket", surface=surface, pose=pose,
@@ -547,7 +547,7 @@ def test_the_best_evidence_leads_a_place_not_the_first_proposal(
         )
         for pose in (wrong, coarse)
     ]  # fmt: skip
-    targets = replace(TARGETS, objects={"bracket": known})
+    targets = replace(TARGETS, objects={"bracket": target})
     refined = search._refine(candidates, frame, view, targets)
     assert not any(candidate.rejected for candidate in refined)
     leader = search._group(refined)[0][0]

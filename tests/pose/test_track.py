@@ -28,7 +28,7 @@ from depthpose.pose.predictions import Prediction, parse_prediction, prediction_
 from depthpose.pose.refusals import Refused
 from depthpose.pose.track import track
 from depthpose.pose.types import Alternative, PoseEstimate, ViewInput
-from depthpose.pose.verify.known_object import KnownObject
+from depthpose.pose.verify.target_object import TargetObject
 
 HIDDEN = 0.68
 
@@ -107,14 +107,14 @@ def test_it_is_lost_where_it_is_taken_away_or_covered_and_found_when_back() -> N
 
 def test_a_track_that_its_history_ends_does_not_blame_the_frame() -> None:
     pose = pose_at(z_m=0.7, seed=3)
-    known = KnownObject(number=0, model=bracket())
+    target = TargetObject(number=0, model=bracket())
     doubted = track_module._Track(pose=pose.double(), motion=None, log_odds=-9.0, first=None)
     depth_m = frame(pose)
     everywhere = torch.ones_like(depth_m, dtype=torch.bool)
     view = ViewInput(name="a", depth_m=depth_m, mask=everywhere, K=K.float(), object="bracket")
     said = "together with the frames before it the pose is right with a .* alone with 100%$"
     with pytest.raises(Refused, match=said):
-        track_module._follow(view, doubted, known, EstimateConfig())
+        track_module._follow(view, doubted, target, EstimateConfig())
 
 
 def test_what_is_computed_of_the_model_is_not_in_the_time_of_the_first_frame() -> None:
@@ -219,12 +219,12 @@ def test_what_else_it_may_be_moves_along() -> None:
     )  # fmt: skip
     net = oracle(poses)
     model = net.weights.models[0]
-    known = KnownObject(number=0, model=model)
+    target = TargetObject(number=0, model=model)
     views = [back_project(frame(p).double(), K).reshape(-1, 3) for p in poses]
     from depthpose.pose.types import CloudInput
 
     inputs = [CloudInput(name=str(k), points_m=v, object="bracket") for k, v in enumerate(views)]
-    first, second = track(inputs, known, net.config, search=lambda _: start)
+    first, second = track(inputs, target, net.config, search=lambda _: start)
     assert (first.tracking, second.tracking) == ("found", "tracked")
     assert second.certainty is not None
     assert second.copy_certainty is not None
@@ -322,7 +322,7 @@ def test_the_first_pose_may_be_a_matrix() -> None:
             oracle(poses).track(frames, K, first=wrong)
 
 
-def test_an_unknown_object_is_an_error() -> None:
+def test_an_untarget_object_is_an_error() -> None:
     with pytest.raises(InputError, match="object 'spoon': the weights do not know it"):
         oracle(moving(1)).track([], CAMERA, "spoon")
 

@@ -10,7 +10,8 @@ from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError
-from depthpose.depth.types import Map, Match
+from depthpose.depth.types import Map, Match, View
+from depthpose.depth.visible import find_blank_borders
 
 MIN_DISPARITY_PX = 0.01
 """Least disparity of a match, so that depth stays finite; also the disparity of the sky in a pair
@@ -104,6 +105,15 @@ def warp_right_to_left(right: Float[Tensor, "c h w"], disparity_px: Map) -> Floa
     grid = torch.stack([x, y], -1).to(right.dtype)
     sampled = F.grid_sample(right[None], grid[None], padding_mode="border", align_corners=True)
     return torch.where(is_inside, sampled[0], torch.nan)
+
+
+def matched_blankness(right: View, disparity_px: Map) -> Map:
+    """Measure how blank the right view is where it matches each left pixel, 0..1.
+
+    Blank pixels are those of a border without a picture. NaN where the match lies outside.
+    """
+    is_blank = find_blank_borders(right).to(disparity_px)
+    return warp_right_to_left(is_blank[None], disparity_px)[0]
 
 
 def right_disparity_from_left(left_px: Map) -> Map:

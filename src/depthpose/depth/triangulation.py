@@ -10,9 +10,9 @@ from depthpose.depth.disparity import (
     SKY_M,
     depth_from_disparity,
     disparity_from_depth,
-    warp_right_to_left,
+    matched_blankness,
 )
-from depthpose.depth.types import DepthEstimate, DepthInput, Mask, Match, View
+from depthpose.depth.types import DepthEstimate, DepthInput, Match, View
 from depthpose.depth.visible import find_blank_borders, measure_texture
 
 _MIN_SKY_SHARE = 0.002
@@ -38,7 +38,7 @@ def estimate_from_pair(pair: DepthInput, match: Match) -> DepthEstimate:
     match = _without_false_sky(match, pair.left)
     if match.confidence is not None and pair.right is not None:
         texture = measure_texture(pair.left).to(match.confidence)
-        right_is_blank = _find_blank_matches(match, pair.right)
+        right_is_blank = matched_blankness(pair.right, match.disparity_px) > 0.5
         confidence = (match.confidence * texture).masked_fill(right_is_blank, 0.0)
         match = replace(match, confidence=confidence)
     rig = pair.camera if isinstance(pair.camera, StereoRig) else None
@@ -88,10 +88,10 @@ def triangulate(match: Match, depth_input: DepthInput, rig: StereoRig | None) ->
     if rig is not None:
         depth_m = depth_from_disparity(disparity_px, rig)
         # A camera with another baseline than that of the match, as of a synthesised view.
-        own_rig = depth_input.camera
-        if isinstance(own_rig, StereoRig) and own_rig is not rig:
-            disparity_px = disparity_from_depth(depth_m, own_rig)
-            rig = own_rig
+        camera = depth_input.camera
+        if isinstance(camera, StereoRig) and camera is not rig:
+            disparity_px = disparity_from_depth(depth_m, camera)
+            rig = camera
 
     if match.is_sky is not None:
         sky_px = MIN_DISPARITY_PX
@@ -140,10 +140,3 @@ def _without_false_sky(match: Match, left: View) -> Match:
             is_discarded, torch.minimum(confidence, 1 - confidence), confidence
         )
     return replace(match, confidence=confidence, is_sky=is_sky)
-
-
-def _find_blank_matches(match: Match, right: View) -> Mask:
-    """Find the left pixels that are matched with a blank pixel of the right view."""
-    right_blank = find_blank_borders(right).to(match.disparity_px)
-    matched_blank = warp_right_to_left(right_blank[None], match.disparity_px)[0]
-    return matched_blank.nan_to_num(0.0) > 0.5

@@ -43,7 +43,7 @@ from depthpose.pose.search import Instances, SearchTargets, find_objects
 from depthpose.pose.track import track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.verify.decide import choose_object, seconds_of_all
-from depthpose.pose.verify.known_object import KnownObject
+from depthpose.pose.verify.target_object import TargetObject
 
 NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 _NAME = "input"  # what an input is called that came without a name
@@ -77,8 +77,8 @@ class PoseEstimator:
         self.models = tuple(models)
         self.objects = tuple(model.name for model in models)
         """Names of the objects."""
-        self._known = {
-            model.name: KnownObject(
+        self._targets_by_name = {
+            model.name: TargetObject(
                 number=number,
                 model=model,
                 surface_points=self.config.icp.surface_points,
@@ -145,9 +145,9 @@ class PoseEstimator:
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        known = self._find_object(pose_input.object).prepare()
+        target = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
-        work = partial(register, pose_input, known, self.config, watch)
+        work = partial(register, pose_input, target, self.config, watch)
         estimate = estimate_or_refusal(pose_input, watch, work)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
@@ -256,7 +256,7 @@ class PoseEstimator:
             if object is not None or len(self.models) == 1:
                 return self._estimate(pose_input)
             tried = [replace(pose_input, object=name) for name in self.objects]
-            estimates = [self._estimate(one, is_expected=False) for one in tried]
+            estimates = [self._estimate(attempt, is_expected=False) for attempt in tried]
         return choose_object(estimates, self.config.min_certainty)
 
     @force_float32()
@@ -383,8 +383,8 @@ class PoseEstimator:
             InputError: an unknown object, a ``first`` that is no pose, or an estimator that cannot
                 search without one.
         """
-        known = self._find_object(object)
-        which = known.model.name
+        target = self._find_object(object)
+        which = target.model.name
         if isinstance(frames, str | Path):
             raise InputError(
                 f"track: frames is {str(frames)!r}, one path; give a list of files or arrays in "
@@ -424,7 +424,7 @@ class PoseEstimator:
             return find_objects(pose_input, self._targets([which], "one at most"))[0]
 
         inputs = (read(number, frame) for number, frame in enumerate(frames))
-        estimates = track(inputs, known.prepare(), self.config, search, start)
+        estimates = track(inputs, target.prepare(), self.config, search, start)
         return iterate_in_float32(estimates)
 
     def surface_of(self, object: str) -> Surface:
@@ -435,7 +435,7 @@ class PoseEstimator:
         """
         return self._find_object(object).surface
 
-    def _find_object(self, name: str | None) -> KnownObject:
+    def _find_object(self, name: str | None) -> TargetObject:
         """Find an object by its name; None where one alone is known.
 
         Raises:
@@ -451,10 +451,10 @@ class PoseEstimator:
         if not isinstance(name, str):
             listing = ", ".join(map(repr, names))
             raise InputError(f"object {name!r} is no text; give the name of one: {listing}")
-        if name not in self._known:
+        if name not in self._targets_by_name:
             nearest = suggest_name(name, names)
             raise InputError(f"object {name!r}: the {self.holder} do not know it; {nearest}")
-        return self._known[name]
+        return self._targets_by_name[name]
 
 
 def _require_input(pose_input: AnyInput) -> AnyInput:

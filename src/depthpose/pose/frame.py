@@ -129,13 +129,13 @@ def prepare_frame(
     if background is not None:
         background_m = background.depth_m[::step, ::step].double().nan_to_num(torch.inf)
         is_seen = background.is_seen[::step, ::step]
-        known = Background(depth_m=background_m, is_seen=is_seen, diameter_m=math.inf)
-        backgrounds.append(known)
+        known_background = Background(depth_m=background_m, is_seen=is_seen, diameter_m=math.inf)
+        backgrounds.append(known_background)
         is_searched &= ~background_m.isfinite()
     backgrounds += find_wide_planes(depth_m, points_m, normals, rays, noise_per_m2, is_searched)
     limit_m = torch.zeros_like(depth_m)
-    for one in backgrounds:
-        limit_m[one.is_seen] = one.diameter_m
+    for surface in backgrounds:
+        limit_m[surface.is_seen] = surface.diameter_m
 
     read_m = torch.where(depth_m > 0, depth_m, torch.inf)
     nearest_m = -max_pool2d(-read_m[None], 5, 1, 2)[0]

@@ -42,8 +42,8 @@ from depthpose.pose.types import (
     Vote,
     VotingPoints,
 )
-from depthpose.pose.verify.known_object import KnownObject, has_surface, require_surface
 from depthpose.pose.verify.observability import free_motions, without_motions
+from depthpose.pose.verify.target_object import TargetObject, has_surface, require_surface
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
@@ -63,7 +63,7 @@ class CloudJob:
     """A cloud that is prepared for the network, and then its directions."""
 
     pose_input: AnyInput  #: from which the cloud is lifted
-    known: KnownObject  #: its object
+    target: TargetObject  #: its object
     cloud: ObjectCloud  #: all points of the object
     voxels: VoxelGrid  #: with the points that the network sees and that vote, one for each voxel
     watch: Stopwatch  #: of the stages so far
@@ -218,18 +218,18 @@ class GeoPoseNet(PoseEstimator):
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        known = self._find_object(pose_input.object).prepare()
+        target = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
 
         def lift() -> CloudJob:
             """Lift it to the points of the object, and these to voxels."""
             with watch.stage("cloud"):
-                cloud = prepare_cloud(pose_input, known.model, self.weights.cloud, self.config)
+                cloud = prepare_cloud(pose_input, target.model, self.weights.cloud, self.config)
                 seed = self.config.voting.seed
                 voxels = sample_and_voxelise(cloud.cloud_m, self.weights.cloud, seed)
             return CloudJob(
                 pose_input=pose_input,
-                known=known,
+                target=target,
                 cloud=cloud,
                 voxels=voxels,
                 watch=watch,
@@ -249,7 +249,7 @@ class GeoPoseNet(PoseEstimator):
             grids = [job.voxels for job in jobs]
             counts = [len(grid.points_m) for grid in grids]
             cloud_of_point = torch.repeat_interleave(torch.arange(len(jobs)), torch.tensor(counts))
-            numbers = torch.tensor([job.known.number for job in jobs])
+            numbers = torch.tensor([job.target.number for job in jobs])
             coordinates = torch.cat([grid.coordinates for grid in grids])
             points_m = [grid.points_m @ grid.grid_from_camera.mT for grid in grids]
             device = self.config.device
@@ -297,13 +297,13 @@ class GeoPoseNet(PoseEstimator):
             Refused: the votes or the evidence do not allow a pose.
         """
         config = self.config
-        known = job.known
+        target = job.target
         watch = job.watch
 
         # Propose: where the directions meet are the keypoints, to which the model's are fitted.
         with watch.stage("proposal"):
             vote = self._vote(job)
-            fits = fit_poses(vote, known.model, config)
+            fits = fit_poses(vote, target.model, config)
 
         # Refine; where ICP brings no point near the model, the fit of the keypoints stays.
         poses = fits.camera_from_model.double()
@@ -312,17 +312,17 @@ class GeoPoseNet(PoseEstimator):
         if config.with_icp:
             with watch.stage("icp"):
                 cloud_m = job.cloud.cloud_m.double()
-                rotated = rotate_starts(poses, known.surface, config.icp.starts)
-                by_icp, minima = refine_best(cloud_m, poses, known.surface, config.icp, rotated)
+                rotated = rotate_starts(poses, target.surface, config.icp.starts)
+                by_icp, minima = refine_best(cloud_m, poses, target.surface, config.icp, rotated)
             if float(by_icp.inlier_share) > 0:
                 refined = by_icp
                 others = minima
 
         # Where little of a part is visible, all votes may mean the wrong end of it. Poses that
         # point pairs propose compete with the one that was voted for.
-        if config.with_icp and job.is_expected and has_surface(known.model):
+        if config.with_icp and job.is_expected and has_surface(target.model):
             with watch.stage("proposal"):
-                proposals = propose_by_pairs(job.cloud, known, config.voting.seed)
+                proposals = propose_by_pairs(job.cloud, target, config.voting.seed)
             others = Rigid.cat([others, proposals])
 
         # Compare, compete, decide.
@@ -333,7 +333,7 @@ class GeoPoseNet(PoseEstimator):
         try:
             estimate = judge(
                 job.cloud,
-                known,
+                target,
                 refined,
                 others,
                 config,
@@ -362,8 +362,8 @@ class GeoPoseNet(PoseEstimator):
         the copy whose keypoints the directions fit best.
         """
         # The copy that fits some of the directions best.
-        keypoints_m = job.known.model.keypoints_m.double()
-        copies_m = (pose @ job.known.copies.trained).apply(keypoints_m)
+        keypoints_m = job.target.model.keypoints_m.double()
+        copies_m = (pose @ job.target.copies.trained).apply(keypoints_m)
         points_m = job.voxels.points_m.double()
         directions = normalize(job.directions.double(), dim=-1)
         step = max(1, len(points_m) // _COMPARED)
@@ -408,7 +408,7 @@ class DepthImageRegressor(PoseEstimator):
 
     def _estimate(self, pose_input: AnyInput, *, is_expected: bool = True) -> PoseEstimate:
         """Regress the pose from a crop of the depth image, and refine it by ICP."""
-        known = self._find_object(pose_input.object)
+        target = self._find_object(pose_input.object)
         if not isinstance(pose_input, ViewInput):
             raise InputError(NEEDS_MASK)
         # An empty region means that nothing was detected: it is refused below for too few pixels.
@@ -417,24 +417,26 @@ class DepthImageRegressor(PoseEstimator):
         if not is_expected:
             names = ", ".join(self.objects)
             raise InputError(f"object: say which of {names}; a regressor refuses none")
-        _ = known.surface  # computed before any stage is timed
+        _ = target.surface  # computed before any stage is timed
         watch = Stopwatch()
-        work = partial(self._regress, pose_input, known, watch)
+        work = partial(self._regress, pose_input, target, watch)
         return estimate_or_refusal(pose_input, watch, work)
 
-    def _regress(self, pose_input: ViewInput, known: KnownObject, watch: Stopwatch) -> PoseEstimate:
+    def _regress(
+        self, pose_input: ViewInput, target: TargetObject, watch: Stopwatch
+    ) -> PoseEstimate:
         """Regress the pose of one object, and refine it.
 
         Args:
             pose_input: a depth image with the mask of the object.
-            known: the object.
+            target: the object.
             watch: to which the times of the stages are added.
 
         Raises:
             Refused: the mask has too few readings.
         """
         config = self._network.config
-        model = known.model
+        model = target.model
 
         # The crop that the network sees, and the pose that it regresses.
         with watch.stage("network"):
@@ -444,7 +446,7 @@ class DepthImageRegressor(PoseEstimator):
             raise Refused("too few points", reason)
         with watch.stage("network"):
             batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
-            numbers = torch.tensor([known.number], device=self.config.device)
+            numbers = torch.tensor([target.number], device=self.config.device)
             poses = make_poses(self._network(batch.image, numbers), batch)
             pose = Rigid(poses.R[0].cpu().float(), poses.t_m[0].cpu().float())
         estimate = PoseEstimate(
@@ -465,8 +467,8 @@ class DepthImageRegressor(PoseEstimator):
         require_points(points_m, self._cloud)
         with watch.stage("icp"):
             icp = self.config.icp
-            rotated = rotate_starts(pose[None].double(), known.surface, icp.starts)
-            refined, _ = refine_best(points_m, pose, known.surface, icp, rotated)
+            rotated = rotate_starts(pose[None].double(), target.surface, icp.starts)
+            refined, _ = refine_best(points_m, pose, target.surface, icp, rotated)
         if float(refined.inlier_share) == 0:  # no point near the surface: nothing was refined
             return estimate
         free = free_motions(model.symmetries.continuous, refined.camera_from_model.double())

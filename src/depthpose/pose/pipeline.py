@@ -23,7 +23,7 @@ from depthpose.pose.types import AnyInput, PoseEstimate, PoseFit
 from depthpose.pose.verify.decide import decide
 from depthpose.pose.verify.evidence import observe
 from depthpose.pose.verify.hypotheses import compete
-from depthpose.pose.verify.known_object import KnownObject
+from depthpose.pose.verify.target_object import TargetObject
 
 _VOTING_DIAMETERS = 0.05  # distance of the points that vote
 _PROPOSALS = 40  # poses that point pairs propose
@@ -32,7 +32,7 @@ _SMOOTHED_POINTS = 1500  # of so many, 20 neighbours give a normal that noise ha
 
 def register(
     pose_input: AnyInput,
-    known: KnownObject,
+    target: TargetObject,
     config: EstimateConfig,
     watch: Stopwatch,
     *,
@@ -43,7 +43,7 @@ def register(
 
     Args:
         pose_input: the points.
-        known: the object.
+        target: the object.
         config: of ICP and limits.
         watch: to which the times of the stages are added.
         proposals: poses of a search; None: point pairs of the points propose.
@@ -55,17 +55,17 @@ def register(
     """
     # The usable points of the object.
     with watch.stage("cloud"):
-        cloud = prepare_cloud(pose_input, known.model, CloudConfig(), config)
+        cloud = prepare_cloud(pose_input, target.model, CloudConfig(), config)
 
     # Propose.
     with watch.stage("proposal"):
         if proposals is None:
-            proposals = propose_by_pairs(cloud, known, config.voting.seed)
+            proposals = propose_by_pairs(cloud, target, config.voting.seed)
 
     # Refine.
     with watch.stage("icp"):
         cloud_m = cloud.cloud_m.double()
-        refined, others = refine_best(cloud_m, proposals, known.surface, config.icp)
+        refined, others = refine_best(cloud_m, proposals, target.surface, config.icp)
     if float(refined.inlier_share) == 0:
         raise Refused(
             "no pose found",
@@ -73,22 +73,22 @@ def register(
         )
 
     # Compare, compete, decide.
-    return judge(cloud, known, refined, others, config, watch, is_expected=is_expected)
+    return judge(cloud, target, refined, others, config, watch, is_expected=is_expected)
 
 
-def propose_by_pairs(cloud: ObjectCloud, known: KnownObject, seed: int) -> Rigid:
+def propose_by_pairs(cloud: ObjectCloud, target: TargetObject, seed: int) -> Rigid:
     """Propose poses by the point pairs of a cloud."""
     dense_m = take_evenly(cloud.cloud_m.double(), _SMOOTHED_POINTS)
-    step_m = _VOTING_DIAMETERS * known.surface.diameter_m
+    step_m = _VOTING_DIAMETERS * target.surface.diameter_m
     voting_m = dense_m[thin_cloud(dense_m, torch.zeros_like(dense_m), step_m)]
     normals, _ = fit_local_planes(dense_m, voting_m)
     generator = torch.Generator().manual_seed(seed)
-    return propose_poses(voting_m, normals, known.pairs, _PROPOSALS, generator)
+    return propose_poses(voting_m, normals, target.pairs, _PROPOSALS, generator)
 
 
 def judge(
     cloud: ObjectCloud,
-    known: KnownObject,
+    target: TargetObject,
     refined: PoseFit,
     others: Rigid,
     config: EstimateConfig,
@@ -101,7 +101,7 @@ def judge(
 
     Args:
         cloud: points of the object.
-        known: the object.
+        target: the object.
         refined: the best pose.
         others: at which refinement ended too, or that were proposed.
         config: of limits, and of ICP, without which competing poses stay where they are.
@@ -114,13 +114,13 @@ def judge(
     """
     # The best pose against its near-symmetric copies, look-alikes and other local minima.
     with watch.stage("evidence"):
-        observation = observe(cloud.cloud_m, cloud.view, known.surface, is_masked=cloud.is_masked)
+        observation = observe(cloud.cloud_m, cloud.view, target.surface, is_masked=cloud.is_masked)
         has_color = cloud.view is not None and cloud.view.color is not None
         competition = compete(
             cloud.cloud_m.double(),
             refined,
             others,
-            known,
+            target,
             observation,
             config,
             cloud.view if has_color else None,
@@ -130,7 +130,7 @@ def judge(
     with watch.stage("decision"):
         estimate = decide(
             cloud,
-            known,
+            target,
             competition,
             observation,
             config=config,

@@ -21,7 +21,7 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate
-from depthpose.pose.verify.known_object import require_surface
+from depthpose.pose.verify.target_object import require_surface
 
 
 class Registration(PoseEstimator):

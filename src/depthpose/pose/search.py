@@ -48,13 +48,13 @@ from depthpose.pose.verify.decide import (
     with_status,
 )
 from depthpose.pose.verify.evidence import compare, observe
-from depthpose.pose.verify.known_object import KnownObject
 from depthpose.pose.verify.probability import (
     LEAST_POSSIBLE,
     log_odds_right,
     probability_of_instances,
     probability_right,
 )
+from depthpose.pose.verify.target_object import TargetObject
 
 _MOST_PROPOSALS = 40
 """Largest number of proposals that are looked at in an image."""
@@ -84,7 +84,7 @@ Instances = Literal["one", "one at most", "any number"]  #: see ``SearchTargets.
 class SearchTargets:
     """What is looked for."""
 
-    objects: Mapping[str, KnownObject]  #: by their names
+    objects: Mapping[str, TargetObject]  #: by their names
     config: EstimateConfig  #: of ICP and limits
     #: how many of each object there are: ``one`` in a detector's box, ``one at most`` in a frame of
     #: a track, ``any number`` in another image.
@@ -161,8 +161,8 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
 
     names = list(targets.objects)
     examined: list[Candidate] = []  # what each stage makes of them
-    claimed: list[Candidate] = []  # found, or of one of several objects
-    found: list[Candidate] = []
+    claimed: list[Candidate] = []  # all maxima, whose places are taken
+    accepted: list[Candidate] = []  # the maxima that show a certain object
     for _ in range(1 if targets.is_single else _ROUNDS):
         proposed = _propose(frame, is_searched, names, claimed, targets)
         refined = _refine(proposed, frame, region, targets)
@@ -172,28 +172,28 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         examined += [*refined, *registered, *suppressed, *answered]
 
         # No later candidate may lie where a maximum lies, though it may be open which object it
-        # shows; the inliers of what is found are not even searched again.
+        # shows; the inliers of what is accepted are not even searched again.
         claimed += maxima
         new = _remaining(answered)
-        found += new
+        accepted += new
         for candidate in new:
             is_searched &= ~candidate.inliers
 
         # What is there twice may be there more often; what is there once is not looked for again.
-        count = Counter(candidate.object for candidate in found)
+        count = Counter(candidate.object for candidate in accepted)
         names = sorted({candidate.object for candidate in new if count[candidate.object] > 1})
         if not names:
             break
 
-    weighed = _weigh_instances(found, targets)
+    weighed = _weigh_instances(accepted, targets)
     examined += weighed
 
     spent_s = time.perf_counter() - began
     estimates = _answer_instances(weighed, region, targets, spent_s)
-    missing = set(targets.objects) - {candidate.object for candidate in _remaining(weighed)}
+    answered_names = {candidate.object for candidate in _remaining(weighed)}
     rejected = [candidate for candidate in examined if candidate.rejected]
     for name in targets.objects:
-        if name in missing:
+        if name not in answered_names:
             misses = [candidate for candidate in rejected if candidate.object == name]
             estimates.append(nothing_found(view, name, misses, spent_s))
     if len(estimates) == 1:
@@ -207,7 +207,7 @@ def _answer_instances(
     """Make the estimate of each instance, the surest first, and rank them for picking."""
     estimates: list[PoseEstimate] = []
     for candidate in _rank(weighed):
-        assert candidate.estimate is not None, "what is found was registered"
+        assert candidate.estimate is not None, "what is accepted was registered"
         estimate = with_status(candidate.estimate, targets.config.min_certainty)
         estimates.append(replace(estimate, seconds={**estimate.seconds, "search": spent_s}))
     if targets.is_single:
@@ -458,20 +458,22 @@ def _weigh_objects(maxima: Sequence[Candidate], candidates: Sequence[Candidate])
     return weighed
 
 
-def _weigh_instances(found: Sequence[Candidate], targets: SearchTargets) -> list[Candidate]:
+def _weigh_instances(accepted: Sequence[Candidate], targets: SearchTargets) -> list[Candidate]:
     """Weigh the instances of each object by each other; reject poses that are likelier wrong.
 
     A pose may be likelier wrong than right because another instance is surer, and a table holds one
     of each object; or because another pose explains its place as well.
     """
     weighed: list[Candidate] = []
-    for name in dict.fromkeys(candidate.object for candidate in found):
-        instances = [candidate for candidate in found if candidate.object == name]
-        log_odds = torch.tensor([one.log_odds for one in instances], dtype=torch.float64)
+    for name in dict.fromkeys(candidate.object for candidate in accepted):
+        instances = [candidate for candidate in accepted if candidate.object == name]
+        log_odds = torch.tensor(
+            [candidate.log_odds for candidate in instances], dtype=torch.float64
+        )
         probabilities = probability_of_instances(log_odds, is_single=targets.is_single)
         shares = probabilities / log_odds.sigmoid()  # of the probability that each has by itself
         for candidate, share in zip(instances, shares.tolist(), strict=True):
-            assert candidate.estimate is not None, "what is found was registered"
+            assert candidate.estimate is not None, "what is accepted was registered"
             estimate = with_share(candidate.estimate, share)
             assert estimate.certainty is not None, "registered poses have evidence"
             reason = ""

@@ -33,13 +33,13 @@ from depthpose.pose.types import (
 )
 from depthpose.pose.verify.decide import require_observable, require_right, with_status
 from depthpose.pose.verify.evidence import compare, observe
-from depthpose.pose.verify.known_object import KnownObject
 from depthpose.pose.verify.observability import free_motions, without_motions
 from depthpose.pose.verify.probability import (
     PRIOR_EXPECTED,
     log_likelihood_ratio,
     probability_right,
 )
+from depthpose.pose.verify.target_object import TargetObject
 
 _MARGIN_DIAMETERS = 0.15
 """Largest distance from the surface at the last or the predicted pose of points that may be the
@@ -137,7 +137,7 @@ class _Track:
 
 def track(
     frames: Iterable[AnyInput | PoseEstimate],
-    known: KnownObject,
+    target: TargetObject,
     config: EstimateConfig,
     search: Callable[[AnyInput], PoseEstimate],
     first: Rigid | None = None,
@@ -147,7 +147,7 @@ def track(
     Args:
         frames: views or clouds. In place of a frame that cannot be read, an estimate that says so:
             it is yielded unchanged, and the next frame is estimated from the pose before.
-        known: the object.
+        target: the object.
         config: of ICP and limits.
         search: poses the object in a frame where it is not followed.
         first: its rough pose ``camera_from_model`` in the first frame; None: it is searched.
@@ -164,7 +164,7 @@ def track(
         if isinstance(pose_input, PoseEstimate):
             yield pose_input
             continue
-        work = partial(_follow_or_search, pose_input, current, known, config, search)
+        work = partial(_follow_or_search, pose_input, current, target, config, search)
         outcome = unreadable_on_error(pose_input, work)
         if isinstance(outcome, PoseEstimate):
             yield outcome
@@ -182,7 +182,7 @@ def track(
 def _follow_or_search(
     pose_input: AnyInput,
     current: _Track | None,
-    known: KnownObject,
+    target: TargetObject,
     config: EstimateConfig,
     search: Callable[[AnyInput], PoseEstimate],
 ) -> tuple[PoseEstimate, _Track | None]:
@@ -202,7 +202,7 @@ def _follow_or_search(
     if current is not None:
         try:
             with watch.stage("tracking"):
-                estimate, following = _follow(pose_input, current, known, config)
+                estimate, following = _follow(pose_input, current, target, config)
         except Refused:  # searched below
             pass
         else:
@@ -227,7 +227,7 @@ def _follow_or_search(
 
 
 def _follow(
-    pose_input: AnyInput, current: _Track, known: KnownObject, config: EstimateConfig
+    pose_input: AnyInput, current: _Track, target: TargetObject, config: EstimateConfig
 ) -> tuple[PoseEstimate, _Track]:
     """Refine the last pose and the predicted one, and weigh the better one by the evidence.
 
@@ -238,7 +238,7 @@ def _follow(
         Refused: the object is not followed.
     """
     # Where it may be: at its last pose, or going on as it moved last.
-    surface = known.surface
+    surface = target.surface
     starts = [current.pose]
     if current.motion is not None:
         starts.insert(0, current.motion.move(current.pose))
@@ -263,13 +263,13 @@ def _follow(
 
     # Is the pose right, and does what is seen of the object determine it?
     weighed = _weigh_pose(pose_input, object_m, pose, current.log_odds, surface, config.limits)
-    free = free_motions(known.model.symmetries.continuous, pose)
-    require_observable(object_m, known, pose, free, config.limits)
+    free = free_motions(target.model.symmetries.continuous, pose)
+    require_observable(object_m, target, pose, free, config.limits)
 
     # The estimate, and the track that the next frame begins with.
     estimate = PoseEstimate(
         name="",
-        object=known.model.name,
+        object=target.model.name,
         status="ok",
         camera_from_model=refined.camera_from_model.float(),
         covariance=without_motions(refined.covariance, free).float(),

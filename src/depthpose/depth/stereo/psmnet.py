@@ -363,12 +363,7 @@ def psmnet_bytes(
 
 
 class PSMNetMatcher(NetworkMatcher):
-    """PSMNet with pre- and post-processing, as :class:`NetworkMatcher` says.
-
-    Raises:
-        InputError: as for :class:`NetworkMatcher`; or a largest disparity, for it searches those of
-            its training.
-    """
+    """PSMNet with pre- and post-processing, as :class:`NetworkMatcher` says."""
 
     fine_pixels = 280_000
     """Pixels of a fine match at most: an image of KITTI at three quarters of its resolution."""

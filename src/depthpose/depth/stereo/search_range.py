@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
-from depthpose.depth.disparity import warp_right_to_left
+from depthpose.depth.disparity import matched_blankness, warp_right_to_left
 from depthpose.depth.stereo.network_matcher import (
     STEP_PX,
     NetworkMatcher,
@@ -113,9 +113,7 @@ def _whole_step_below(disparity_px: float) -> int:
 def _find_picture_pixels(left: Tensor, right: Tensor, disparity_px: Map) -> Mask:
     """Find the left pixels of which neither they nor their matches lie in a blank border."""
     left_blank = find_blank_borders(left).to(disparity_px.device)
-    right_blank = find_blank_borders(right).to(disparity_px)
-    matched_blank = warp_right_to_left(right_blank[None], disparity_px)[0]
-    return ~left_blank & ~(matched_blank > 0)
+    return ~left_blank & ~(matched_blankness(right, disparity_px) > 0)
 
 
 def _find_agreeing_pixels(left_px: Map, right_px: Map, tolerance_px: float) -> Mask:

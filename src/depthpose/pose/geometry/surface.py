@@ -226,8 +226,8 @@ class Surface:
                 ``boxes``: for many poses, or where a distance off by a box is good enough.
         """
         if is_exact:
-            found = find_nearest_points(array_of(local_m).reshape(-1, 3), self.target.tree)
-            sample = torch.from_numpy(found).reshape(local_m.shape[:-1])
+            index = find_nearest_points(array_of(local_m).reshape(-1, 3), self.target.tree)
+            sample = torch.from_numpy(index).reshape(local_m.shape[:-1])
         else:
             sample = self.boxes.look_up(local_m)
         distance_m = (local_m - self.points_m[sample]).norm(dim=-1)

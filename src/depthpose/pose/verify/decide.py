@@ -18,7 +18,6 @@ from depthpose.pose.verify.copies import describe_difference
 from depthpose.pose.verify.evidence import Observation
 from depthpose.pose.verify.hypotheses import Competition, Hypothesis
 from depthpose.pose.verify.identity import identify
-from depthpose.pose.verify.known_object import KnownObject
 from depthpose.pose.verify.observability import free_motions, observability, without_motions
 from depthpose.pose.verify.probability import (
     LEAST_AREA,
@@ -27,6 +26,7 @@ from depthpose.pose.verify.probability import (
     probability_right,
     share_among_objects,
 )
+from depthpose.pose.verify.target_object import TargetObject
 
 _HIDDEN_WEIGHT = 0.5
 """Of an area that was not observed beside one that contradicts: it may only be hidden."""
@@ -40,7 +40,7 @@ LEAST_SHARE = 0.8
 
 def decide(
     cloud: ObjectCloud,
-    known: KnownObject,
+    target: TargetObject,
     competition: Competition,
     observation: Observation,
     *,
@@ -51,7 +51,7 @@ def decide(
 
     Args:
         cloud: points of the object.
-        known: the object.
+        target: the object.
         competition: of its poses.
         observation: that they were compared with.
         config: of limits; without ICP size and mirror image are not tested.
@@ -60,7 +60,7 @@ def decide(
     Raises:
         Refused: it is not observable, doubtful, or of another object.
     """
-    model = known.model
+    model = target.model
     best = competition.best
     probability = probability_right(best.evidence, is_expected=is_expected)
     free = free_motions(model.symmetries.continuous, best.pose)
@@ -74,9 +74,9 @@ def decide(
         "evidence": best.evidence,
     }
     try:
-        require_observable(cloud.cloud_m, known, best.pose, free, config.limits)
+        require_observable(cloud.cloud_m, target, best.pose, free, config.limits)
         require_right(best.evidence, probability, config.limits, is_masked=observation.is_masked)
-        identity = _require_identity(cloud, known, best, observation, config)
+        identity = _require_identity(cloud, target, best, observation, config)
     except Refused as refused:  # all but the pose, so that nobody takes it for an estimate
         reason = refused.reason + (hint if refused.status == "doubtful" else "")
         measured = {**measured, **refused.measured}
@@ -92,7 +92,7 @@ def decide(
         certainty=probability * competition.group_share,
         copy_certainty=probability * competition.best_share,
         identity=identity,
-        alternatives=_list_alternatives(competition, probability, known),
+        alternatives=_list_alternatives(competition, probability, target),
         **measured,
     )
     estimate = with_status(estimate, config.min_certainty)
@@ -103,7 +103,7 @@ def decide(
 
 def require_observable(
     cloud_m: Float[Tensor, "n 3"],
-    known: KnownObject,
+    target: TargetObject,
     pose: Rigid,
     free: Float[Tensor, "k 6"],
     limits: RefusalConfig,
@@ -115,16 +115,16 @@ def require_observable(
 
     Args:
         cloud_m: points of the object, in the camera frame.
-        known: the object.
+        target: the object.
         pose: of it.
         free: motions of declared symmetries, by
             :func:`~depthpose.pose.verify.observability.free_motions`.
         limits: the least share by which every other motion must move the visible surface.
     """
-    near_axis = known.copies.near_axis
+    near_axis = target.copies.near_axis
     if near_axis is not None:
         free = torch.cat([free, free_motions((near_axis,), pose)])
-    observed = observability(cloud_m, pose, known.surface, free)
+    observed = observability(cloud_m, pose, target.surface, free)
     if observed is None:
         raise Refused("doubtful", "too few points lie on the posed surface to determine a pose")
     observable, weakest = observed
@@ -156,7 +156,7 @@ def require_right(
 
 def _require_identity(
     cloud: ObjectCloud,
-    known: KnownObject,
+    target: TargetObject,
     best: Hypothesis,
     observation: Observation,
     config: EstimateConfig,
@@ -172,9 +172,9 @@ def _require_identity(
     identity = identify(
         cloud.cloud_m,
         best.pose,
-        known.model.name,
-        known.surface,
-        known.copies.mirror,
+        target.model.name,
+        target.surface,
+        target.copies.mirror,
         best.evidence,
         observation.focal_px,
         max_size_error,
@@ -185,7 +185,7 @@ def _require_identity(
 
 
 def _list_alternatives(
-    competition: Competition, probability: float, known: KnownObject
+    competition: Competition, probability: float, target: TargetObject
 ) -> tuple[Alternative, ...]:
     """List the poses that may be right in place of the best, the likeliest first."""
     competitors = [(h, share, True) for h, share in competition.copies]
@@ -195,7 +195,7 @@ def _list_alternatives(
         Alternative(
             camera_from_model=hypothesis.pose.float(),
             probability=probability * share,
-            difference=describe_difference(hypothesis.pose, competition.best.pose, known.copies),
+            difference=describe_difference(hypothesis.pose, competition.best.pose, target.copies),
             is_copy=is_copy,
         )
         for hypothesis, share, is_copy in competitors

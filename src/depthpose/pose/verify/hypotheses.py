@@ -19,13 +19,13 @@ from depthpose.pose.types import Axis, Evidence, PoseFit, ViewInput
 from depthpose.pose.verify.color import measure_color_agreement
 from depthpose.pose.verify.color_copies import align_print, propose_color_copies
 from depthpose.pose.verify.evidence import Observation, compare
-from depthpose.pose.verify.known_object import KnownObject
 from depthpose.pose.verify.probability import (
     LEAST_AREA,
     VOTES_RAD,
     log_likelihood_of_copy,
     log_likelihood_ratio,
 )
+from depthpose.pose.verify.target_object import TargetObject
 
 _POINTS = 250  # points of the cloud that refine a competing pose
 _STEPS = 6  # steps of ICP for poses that were refined roughly
@@ -72,7 +72,7 @@ def compete(
     cloud_m: Float64[Tensor, "n 3"],
     refined: PoseFit,
     others: Rigid,
-    known: KnownObject,
+    target: TargetObject,
     observation: Observation,
     config: EstimateConfig,
     view: ViewInput | None = None,
@@ -84,28 +84,28 @@ def compete(
         cloud_m: points of the object, in the camera frame.
         refined: the leading pose.
         others: further poses, refined or only proposed.
-        known: the object.
+        target: the object.
         observation: of it.
         config: of the refinement; without ICP poses stay where they are.
         view: whose colour image tells copies apart; None: depth alone.
         votes_rad: mean angle between a network's directions and those to the keypoints of a pose.
     """
     is_masked = observation.is_masked
-    hypothesize = partial(_hypothesize, known=known, observation=observation, votes_rad=votes_rad)
+    hypothesize = partial(_hypothesize, target=target, observation=observation, votes_rad=votes_rad)
 
     # First round: which pose is it, up to near-symmetric copies? Each pose stands for its copies,
     # one of which may have the surface colours that are observed.
-    different_fits = _refine_different_poses(cloud_m, refined, others, known, config)
+    different_fits = _refine_different_poses(cloud_m, refined, others, target, config)
     different = [hypothesize(fit) for fit in different_fits]
     if view is not None:
-        different = _merge_by_colored_copy(different, known, view)
+        different = _merge_by_colored_copy(different, target, view)
     shares = share_among_poses(different, is_masked=is_masked)
     winner = different[int(shares.argmax())]
 
     # The winner's copies. Another of the different poses may be one too: one between two copies
     # about an axis. Together they have the shares of all of these.
-    copies = _refine_distinct_copies(cloud_m, winner.refined, known, config, view)
-    is_copy = _mark_copies(different, [winner.refined, *copies], known)
+    copies = _refine_distinct_copies(cloud_m, winner.refined, target, config, view)
+    is_copy = _mark_copies(different, [winner.refined, *copies], target)
     joining = [
         hypothesis.refined
         for hypothesis, joins in zip(different, is_copy, strict=True)
@@ -116,9 +116,9 @@ def compete(
     # Second round: which of the copies is it? Each has its own colours.
     group = [hypothesize(fit) for fit in (winner.refined, *copies, *joining)]
     if view is not None:
-        group = _with_own_color(group, known, view)
+        group = _with_own_color(group, target, view)
     copy_shares = group_share * share_among_copies(group, is_masked=is_masked)
-    distinct = _merge_same_poses(group, copy_shares.tolist(), known)
+    distinct = _merge_same_poses(group, copy_shares.tolist(), target)
     best, best_share = max(distinct, key=lambda copy: copy[1])
     return Competition(
         best=best,
@@ -130,7 +130,7 @@ def compete(
 
 def _hypothesize(
     refined: PoseFit,
-    known: KnownObject,
+    target: TargetObject,
     observation: Observation,
     votes_rad: Callable[[Rigid], float] | None,
 ) -> Hypothesis:
@@ -138,25 +138,25 @@ def _hypothesize(
     pose = refined.camera_from_model.double()
     return Hypothesis(
         refined=refined,
-        evidence=compare(observation, pose, known.surface),
+        evidence=compare(observation, pose, target.surface),
         votes_rad=None if votes_rad is None else votes_rad(pose),
     )
 
 
 def _mark_copies(
-    hypotheses: Sequence[Hypothesis], copies: Sequence[PoseFit], known: KnownObject
+    hypotheses: Sequence[Hypothesis], copies: Sequence[PoseFit], target: TargetObject
 ) -> list[bool]:
     """Mark the hypotheses at the pose of one of the copies, up to exact and near-symmetries."""
     copy_poses = Rigid.stack([copy.camera_from_model.double() for copy in copies])
-    symmetries = _all_symmetries(known)
+    symmetries = _all_symmetries(target)
     return [
-        bool(known.copies.is_same(hypothesis.pose, copy_poses, symmetries).any())
+        bool(target.copies.is_same(hypothesis.pose, copy_poses, symmetries).any())
         for hypothesis in hypotheses
     ]
 
 
 def _merge_same_poses(
-    hypotheses: Sequence[Hypothesis], shares: Sequence[float], known: KnownObject
+    hypotheses: Sequence[Hypothesis], shares: Sequence[float], target: TargetObject
 ) -> list[tuple[Hypothesis, float]]:
     """Merge hypotheses of one pose: the likeliest stands for all of them, and has their shares.
 
@@ -167,7 +167,7 @@ def _merge_same_poses(
         same = None
         if distinct:
             poses = Rigid.stack([hypothesis.pose for hypothesis, _ in distinct])
-            is_same = known.copies.is_same(hypotheses[k].pose, poses, known.copies.symmetries)
+            is_same = target.copies.is_same(hypotheses[k].pose, poses, target.copies.symmetries)
             same = int(is_same.int().argmax()) if bool(is_same.any()) else None
         if same is None:
             distinct.append((hypotheses[k], shares[k]))
@@ -180,32 +180,32 @@ def _refine_different_poses(
     cloud_m: Float64[Tensor, "n 3"],
     leading: PoseFit,
     others: Rigid,
-    known: KnownObject,
+    target: TargetObject,
     config: EstimateConfig,
 ) -> list[PoseFit]:
     """List the leading pose, and refined others that are neither it nor a copy of one before.
 
     Others are the ones given, and the look-alikes of the leading pose.
     """
-    copies = known.copies
+    copies = target.copies
     leading_pose = leading.camera_from_model.double()
     starts = Rigid.cat([others.double(), leading_pose @ copies.lookalikes])
     competitors = _refine_competitors(
-        cloud_m, leading, starts, known.surface, config, _MOST_LEADING
+        cloud_m, leading, starts, target.surface, config, _MOST_LEADING
     )
 
     different = [leading]
     for competitor in competitors:
         pose = competitor.refined.camera_from_model
         before = Rigid.stack([other.camera_from_model.double() for other in different])
-        if not bool(copies.is_same(pose, before, _all_symmetries(known)).any()):
+        if not bool(copies.is_same(pose, before, _all_symmetries(target)).any()):
             different.append(competitor.refined)
     return different
 
 
-def _all_symmetries(known: KnownObject) -> Rigid:
+def _all_symmetries(target: TargetObject) -> Rigid:
     """Join exact and near-symmetries of an object, which lead from a pose to its copies."""
-    return Rigid.cat([known.copies.symmetries, known.copies.near_copies])
+    return Rigid.cat([target.copies.symmetries, target.copies.near_copies])
 
 
 def share_among_poses(
@@ -272,31 +272,31 @@ class _Competitor(NamedTuple):
 def _refine_distinct_copies(
     cloud_m: Float64[Tensor, "n 3"],
     winner: PoseFit,
-    known: KnownObject,
+    target: TargetObject,
     config: EstimateConfig,
     view: ViewInput | None,
 ) -> list[PoseFit]:
     """Refine the near-symmetric copies of the winning pose; leave out exact copies of others."""
     winner_pose = winner.camera_from_model.double()
-    starts = winner_pose @ known.copies.near_copies
+    starts = winner_pose @ target.copies.near_copies
     if view is not None:  # colours show finer rotations about an axis than shape does
-        starts = Rigid.cat([propose_color_copies(winner_pose, known.model, view), starts])
-    competitors = _refine_competitors(cloud_m, winner, starts, known.surface, config, _MOST_COPIES)
+        starts = Rigid.cat([propose_color_copies(winner_pose, target.model, view), starts])
+    competitors = _refine_competitors(cloud_m, winner, starts, target.surface, config, _MOST_COPIES)
 
     distinct: list[PoseFit] = []
     distinct_poses = [winner_pose]
     for competitor in competitors:
-        for copy in _settle_copy(competitor, known, view):
+        for copy in _settle_copy(competitor, target, view):
             pose = copy.camera_from_model
             before = Rigid.stack(distinct_poses)
-            if not known.copies.is_same(pose, before, known.copies.symmetries).any():
+            if not target.copies.is_same(pose, before, target.copies.symmetries).any():
                 distinct.append(copy)
                 distinct_poses.append(pose.double())
     return distinct
 
 
 def _settle_copy(
-    competitor: _Competitor, known: KnownObject, view: ViewInput | None
+    competitor: _Competitor, target: TargetObject, view: ViewInput | None
 ) -> list[PoseFit]:
     """List where a copy may lie: where refinement ended and, if it drifted away, its start too.
 
@@ -305,9 +305,9 @@ def _settle_copy(
     refined, start = competitor
     if view is not None:
         # Depth lets a copy drift about an axis of its shape, where its print fixes the angle.
-        settled = align_print(refined.camera_from_model, known.model, view)
+        settled = align_print(refined.camera_from_model, target.model, view)
         refined = replace(refined, camera_from_model=settled)
-    copies = known.copies
+    copies = target.copies
     start_pose = start.camera_from_model[None]
     if copies.is_same(refined.camera_from_model, start_pose, copies.symmetries).any():
         return [refined]
@@ -338,20 +338,20 @@ def _measure_twist(R: Float64[Tensor, "3 3"], axis: Float64[Tensor, "3"]) -> Flo
 
 
 def _merge_by_colored_copy(
-    hypotheses: Sequence[Hypothesis], known: KnownObject, view: ViewInput
+    hypotheses: Sequence[Hypothesis], target: TargetObject, view: ViewInput
 ) -> list[Hypothesis]:
     """Merge poses that are copies of each other, with the colour evidence of their best copies.
 
     Each pose stands for all of its copies. Poses whose best copies by colour are one pose are
     copies of each other: the first stands for them.
     """
-    copies = known.copies
-    symmetries = _all_symmetries(known)
+    copies = target.copies
+    symmetries = _all_symmetries(target)
     distinct: list[Hypothesis] = []
     best_copies: list[Rigid] = []
     for hypothesis in hypotheses:
-        colored = propose_color_copies(hypothesis.pose, known.model, view, motions=symmetries)
-        likelihood = measure_color_agreement(colored, known.model, view).log_likelihood
+        colored = propose_color_copies(hypothesis.pose, target.model, view, motions=symmetries)
+        likelihood = measure_color_agreement(colored, target.model, view).log_likelihood
         best = colored[int(likelihood.argmax())]
         if best_copies and copies.is_same(best, Rigid.stack(best_copies), copies.symmetries).any():
             continue
@@ -361,12 +361,12 @@ def _merge_by_colored_copy(
 
 
 def _with_own_color(
-    hypotheses: Sequence[Hypothesis], known: KnownObject, view: ViewInput
+    hypotheses: Sequence[Hypothesis], target: TargetObject, view: ViewInput
 ) -> list[Hypothesis]:
     """Return poses with the colour evidence of each alone."""
     colored: list[Hypothesis] = []
     for hypothesis in hypotheses:
-        color = measure_color_agreement(hypothesis.pose[None], known.model, view)
+        color = measure_color_agreement(hypothesis.pose[None], target.model, view)
         colored.append(replace(hypothesis, log_color=float(color.log_likelihood[0])))
     return colored
 

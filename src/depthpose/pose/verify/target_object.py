@@ -1,4 +1,4 @@
-"""A known object with all that is computed of its model, once for many inputs."""
+"""An object that is posed, with all that is computed of its model, once for many inputs."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,15 +13,15 @@ _LEAST_POINTS = 500  # a model without faces and with fewer points has no surfac
 
 
 @dataclass(kw_only=True, eq=False)
-class KnownObject:
-    """A known object; each part of what its model gives is computed at its first use, and kept."""
+class TargetObject:
+    """An object that is posed; each part of what its model gives is computed at its first use."""
 
     number: int  #: among the models of an estimator
     model: ObjectModel  #: the object
     surface_points: int = 10_000  #: samples of its surface
     deviation_m: float | None = None  #: of the real surface, as :func:`prepare_surface` takes it
 
-    def prepare(self) -> "KnownObject":
+    def prepare(self) -> "TargetObject":
         """Compute all parts now, in some seconds, so that the time of no input includes it."""
         _ = self.surface
         _ = self.copies
