@@ -270,6 +270,14 @@ def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
     return left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
 
 
+def _take_sky(maps: _Maps, by_generator: _Maps) -> _Maps:
+    """Take the sky, with the confidence there, from the generator, as the estimator does."""
+    assert by_generator.sky is not None, "a selecting generator gives the sky"
+    is_sky = by_generator.sky.op("Greater", _HALF)
+    confidence = is_sky.op("Where", by_generator.confidence, maps.confidence)
+    return maps._replace(sky=by_generator.sky, confidence=confidence)
+
+
 def _make_example_image(multiple: int) -> Tensor:
     """Make an example image, as ``convert_network`` needs it to trace a generator."""
     return torch.rand(2, 3, 2 * multiple, 3 * multiple)
@@ -323,7 +331,7 @@ def image_graph(weights: DepthWeights) -> Graph:
         assert weights.matcher is not None, "checked before"
         maps = _add_matcher(left, right, np.array([config.virtual_focal_px] * 2), weights.matcher)
         if generator_maps is not None:
-            maps = maps._replace(sky=generator_maps.sky)
+            maps = _take_sky(maps, generator_maps)
     assert maps is not None
 
     # Depth at the size of the image.
