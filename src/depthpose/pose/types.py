@@ -294,8 +294,8 @@ class Evidence:
 
     @property
     def contradicted(self) -> float:
-        """Patches that contradict the pose."""
-        return self.seen_through + self.bulging + self.beside + self.continued
+        """Area of the patches that contradict the pose."""
+        return self.seen_through + self.bulging + self.beside
 
     @property
     def agreement(self) -> float:

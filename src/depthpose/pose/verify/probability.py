@@ -118,10 +118,9 @@ def log_likelihood_ratio(evidence: Evidence) -> float:
     if area < LEAST_AREA:
         return 0.0
     # Only what was observed can contradict a pose, and what contradicts it was observed.
-    contradicted_area = evidence.seen_through + evidence.bulging + evidence.beside
     observed_area = max(LEAST_AREA, area - evidence.unobserved)
     contradicted = _log_ratio(
-        RIGHT_CONTRADICTED, WRONG_CONTRADICTED, contradicted_area, observed_area
+        RIGHT_CONTRADICTED, WRONG_CONTRADICTED, evidence.contradicted, observed_area
     )
     rest = max(LEAST_AREA, area - evidence.seen_through - evidence.bulging)
     unobserved = _log_ratio(RIGHT_UNOBSERVED, WRONG_UNOBSERVED, evidence.unobserved, rest)
