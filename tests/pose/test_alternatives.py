@@ -147,7 +147,7 @@ def test_copies_of_a_plate_stay_where_its_symmetry_has_them(seed: int) -> None:
     refined = refine_exactly(cloud_m, leading, target.surface, start_diameters=0.05)
     observation = observe(cloud_m, view, target.surface, is_masked=True)
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
-    competition = compete(cloud_m, refined, none, target, observation, EstimateConfig())
+    competition = compete(observation, refined, none, target, EstimateConfig())
     poses = [competition.best.pose, *(copy.pose for copy, _ in competition.copies)]
     errors = [float(add_m(pose.float(), truth.float(), plate.vertices_m)) for pose in poses]
     assert min(errors) < 0.004
@@ -172,9 +172,9 @@ def test_a_copy_that_drifts_competes_where_it_began_too(monkeypatch: pytest.Monk
     truth = pose_at(seed=1).double()
     turned = partial(turned_about_near_axis, target, truth)
     competitors = [
-        hypotheses._Competitor(refined=turned(0.0), unrefined=turned(60.0)),
-        hypotheses._Competitor(refined=turned(150.0), unrefined=turned(120.0)),
-        hypotheses._Competitor(refined=turned(203.0), unrefined=turned(200.0)),
+        hypotheses._Competitor(refined=turned(0.0), start=turned(60.0).camera_from_model),
+        hypotheses._Competitor(refined=turned(150.0), start=turned(120.0).camera_from_model),
+        hypotheses._Competitor(refined=turned(203.0), start=turned(200.0).camera_from_model),
     ]
     monkeypatch.setattr(hypotheses, "_refine_competitors", lambda *_: competitors)
     copies = hypotheses._refine_distinct_copies(
@@ -202,9 +202,8 @@ def test_a_pose_that_is_one_of_the_copies_competes_with_none(
     monkeypatch.setattr(hypotheses, "_refine_distinct_copies", lambda *_: [turned(49.5)])
     cloud_m = cloud_of(mug, truth.float()).double()
     observation = observe(cloud_m, None, target.surface, is_masked=True)
-    competition = compete(
-        cloud_m, turned(0), Rigid.stack([truth]), target, observation, EstimateConfig()
-    )
+    others = Rigid.stack([truth])
+    competition = compete(observation, turned(0), others, target, EstimateConfig())
     assert len(competition.others) == 1
     total = competition.group_share + competition.others[0][1]
     assert total == pytest.approx(1)
@@ -232,12 +231,13 @@ def test_a_copy_that_drifted_about_an_axis_is_put_back_to_its_angle_alone() -> N
     target = TargetObject(number=0, model=mug)
     shift = Rigid(torch.eye(3).double(), torch.tensor([0.0, 0.0, 0.004]).double())
     turned = partial(turned_about_near_axis, target, pose_at(seed=1).double())
-    start, drifted = turned(30.0), turned(70.0)
+    start = turned(30.0).camera_from_model
+    drifted = turned(70.0)
     refined = replace(drifted, camera_from_model=shift @ drifted.camera_from_model)
     undone = hypotheses._undo_drift(refined, start, target.copies.near_axis)
-    expected = (shift @ start.camera_from_model).matrix()
+    expected = (shift @ start).matrix()
     torch.testing.assert_close(undone.camera_from_model.matrix(), expected, atol=1e-6, rtol=0)
-    assert hypotheses._undo_drift(refined, start, None) is start
+    assert hypotheses._undo_drift(refined, start, None).camera_from_model is start
 
 
 def test_proposals_of_a_shape_are_cached_to_the_bit(

@@ -84,7 +84,7 @@ def test_trees_of_few_points(count: int) -> None:
 
 @pytest.mark.parametrize("is_exact", [True, False])
 def test_matches_face_the_camera(surface: Surface, is_exact: bool) -> None:
-    target, generator = surface.target, np.random.default_rng(2)
+    target, generator = surface.sample_tree, np.random.default_rng(2)
     queries = 0.4 * surface.diameter_m * generator.normal(size=(200, 3))
     eye, limit = np.array([0.1, -0.3, 0.8]), 0.15 * surface.diameter_m
     places = np.full(200, -1)
@@ -147,7 +147,7 @@ def test_residuals_change_with_a_scale_as_their_derivatives_say(surface: Surface
     limit = 0.1 * surface.diameter_m
     places = np.full((2, len(local_m)), -1)
     here, there = (
-        _linearise_growth(local_m, scale, middle, limit, surface.target, True, places[k])
+        _linearise_growth(local_m, scale, middle, limit, surface.sample_tree, True, places[k])
         for k, scale in enumerate((1.0, 1.0 + 1e-7))
     )
     both = (here.weight > 0) & (there.weight > 0) & (places[0] == places[1])

@@ -60,7 +60,7 @@ def test_a_used_estimator_answers_in_a_worker_and_afterwards(tmp_path: Path) -> 
 
 def test_no_array_stands_on_memory_that_sending_a_surface_frees() -> None:
     surface = prepare_surface(make_part("connector"))
-    before = surface.target
+    before = surface.sample_tree
     arrays = [before.low, before.counts, before.ball, before.normals, before.tree.points]
     values = [array.copy() for array in arrays]
     tensors = [surface.boxes.low_m, surface.boxes.counts, surface.ball_m, surface.points_m]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig, VotingConfig
 from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.registration import Registration
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
@@ -170,3 +170,8 @@ def test_a_plane_is_unobservable_and_a_corner_is_not() -> None:
     assert of_whole is not None
     assert of_whole[0] > 0.15
     assert observability(torch.ones(100, 3), pose, surface, none) is None
+
+
+def test_the_rigidity_of_rough_votes_counts_only_with_icp() -> None:
+    config = EstimateConfig(with_icp=False, voting=VotingConfig(rigidity_diameters=0.4))
+    assert config.voting.rigidity_diameters > config.rough_rigidity_diameters

@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 from bench.negatives import random_part
-from tests.pose.synthetic_objects import write_part
+from tests.pose.synthetic_objects import K, pose_at, view_of, write_part
 
 from depthpose import GeoPoseNet, Registration
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, VotingConfig
 from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.mesh import make_model, sample_surface
@@ -22,7 +23,7 @@ from depthpose.pose.network_pose import CloudJob
 from depthpose.pose.propose.point_pairs import prepare_pairs, propose_poses
 from depthpose.pose.refusals import Refused
 from depthpose.pose.synthetic import SyntheticViews, make_part
-from depthpose.pose.types import CloudSample, ObjectModel, PoseEstimate
+from depthpose.pose.types import CloudInput, CloudSample, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
 
 
@@ -218,3 +219,15 @@ def test_what_a_network_refuses_is_registered_by_networks_that_vote() -> None:
 def test_registration_of_what_is_refused_needs_icp() -> None:
     with pytest.raises(InputError, match="registration refines by ICP"):
         EstimateConfig(register_refused=True, with_icp=False)
+
+
+def test_a_cloud_beside_its_depth_image_is_refused() -> None:
+    depth_m, mask = view_of(part(), pose_at())
+    of_image = ViewInput(name="x", depth_m=depth_m, mask=mask, K=K, object=part().name)
+    points_m = cloud_from_depth(depth_m, mask, K)
+    inside = CloudInput(name="in", points_m=points_m, object=part().name, view=of_image)
+    aside_m = points_m + torch.tensor([0.6, 0.0, 0.0])
+    refused, posed = registration().estimate_many([replace(inside, points_m=aside_m), inside])
+    assert posed.is_posed
+    assert refused.status == "unusable input"
+    assert "100% of the points lie outside the" in refused.reason

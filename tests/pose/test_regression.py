@@ -13,7 +13,7 @@ from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, Refusa
 from depthpose.pose.metrics import add_m
 from depthpose.pose.network_pose import DepthImageRegressor
 from depthpose.pose.networks.baselines import DepthImageConfig, DepthImageNet
-from depthpose.pose.types import ViewInput
+from depthpose.pose.types import KnownBackground, ViewInput
 from depthpose.pose.weights import PoseWeights
 
 
@@ -104,3 +104,23 @@ def test_a_refusal_of_too_few_pixels_says_what_it_took(
     (refused,) = DepthImageRegressor(weights).estimate_many([empty])
     assert refused.status == "too few points"
     assert list(refused.seconds) == ["network"]
+
+
+def test_a_known_background_is_not_taken_for_the_object(weights: PoseWeights) -> None:
+    depth_m, mask = view_of(bracket(), pose_at())
+    everywhere = torch.ones_like(mask)
+    wall_m = torch.full_like(depth_m, 1.2)
+    background = KnownBackground(depth_m=wall_m, is_seen=~mask)
+    loose = ViewInput(
+        name="seen",
+        depth_m=torch.where(mask, depth_m, wall_m),
+        mask=everywhere,
+        K=K,
+        object="bracket",
+        background=background,
+    )
+    net = DepthImageRegressor(weights)
+    by_background, by_mask = net.estimate_many([loose, seen()])
+    assert by_background.camera_from_model is not None
+    assert by_mask.camera_from_model is not None
+    assert torch.equal(by_background.camera_from_model.t_m, by_mask.camera_from_model.t_m)

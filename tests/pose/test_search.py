@@ -24,7 +24,7 @@ from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose import search
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.frame import prepare_frame
+from depthpose.pose.frame import crop_to_region, prepare_frame
 from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.inliers import frame_inliers, share_in_background
 from depthpose.pose.inputs import view_input
@@ -35,8 +35,9 @@ from depthpose.pose.propose.image import propose_in_frame, score_by_image
 from depthpose.pose.propose.point_pairs import prepare_pairs
 from depthpose.pose.registration import Registration
 from depthpose.pose.search import SearchTargets, find_objects
+from depthpose.pose.sensor import SHARED_PER_WHITE
 from depthpose.pose.synthetic.parts import make_part
-from depthpose.pose.types import CloudInput, Evidence, ObjectModel, PoseEstimate
+from depthpose.pose.types import CloudInput, Evidence, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.verify.copies import find_copies
 from depthpose.pose.verify.evidence import compare, observe
 from depthpose.pose.verify.target_object import TargetObject
@@ -634,3 +635,35 @@ def test_a_mask_that_does_not_fit_is_searched_as_a_region(net: Registration) -> 
     found = net.estimate(depth=table(), mask=loose.numpy(), camera=CAMERA, object="bracket")
     assert found.camera_from_model is not None, found.reason
     assert float(add_m(found.camera_from_model, TRUTHS[0], bracket().vertices_m)) < 0.005
+
+
+def test_a_window_has_the_noise_of_the_whole_image() -> None:
+    """White noise shows that neighbours share none; a small window shows too few of them."""
+    random = torch.Generator().manual_seed(0)
+    depth_m = 1 + 0.001 * torch.randn(240, 320, generator=random)
+    mask = torch.zeros(240, 320, dtype=torch.bool)
+    mask[100:120, 100:120] = True
+    whole = ViewInput(name="x", depth_m=depth_m, mask=mask, K=K.float(), object="bracket")
+    window = crop_to_region(whole)
+    assert window.depth_m.shape < whole.depth_m.shape
+    assert window.shared_per_white == whole.shared_per_white < SHARED_PER_WHITE
+    assert replace(window, whole_m=None).shared_per_white == SHARED_PER_WHITE
+
+
+def test_a_box_of_any_object_needs_more_evidence(
+    net: Registration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    instances: list[str] = []
+
+    def record(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
+        instances.append(targets.instances)
+        return [PoseEstimate(name=view.name, object=view.object, status="doubtful", reason="x")]
+
+    monkeypatch.setattr("depthpose.pose.estimator.find_objects", record)
+    region = ViewInput(
+        name="x", depth_m=table(), mask=torch.ones(240, 320, dtype=torch.bool), K=K.float(),
+        object="bracket", is_region=True,
+    )  # fmt: skip
+    net._search_region(region)
+    net._search_region(region, is_expected=False)
+    assert instances == ["one", "one at most"]

@@ -10,8 +10,10 @@ from tests.pose.synthetic_objects import (
     CAMERA,
     K,
     Oracle,
+    bottle,
     bracket,
     bracket_surface,
+    cloud_of,
     pose_at,
     tiny_weights,
     view_of,
@@ -26,8 +28,9 @@ from depthpose.pose.config import EstimateConfig
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
 from depthpose.pose.refusals import Refused
+from depthpose.pose.registration import Registration
 from depthpose.pose.track import track
-from depthpose.pose.types import Alternative, PoseEstimate, ViewInput
+from depthpose.pose.types import Alternative, CloudInput, PoseEstimate, ViewInput
 from depthpose.pose.verify.target_object import TargetObject
 
 HIDDEN = 0.68
@@ -322,7 +325,7 @@ def test_the_first_pose_may_be_a_matrix() -> None:
             oracle(poses).track(frames, K, first=wrong)
 
 
-def test_an_untarget_object_is_an_error() -> None:
+def test_an_unknown_object_is_an_error() -> None:
     with pytest.raises(InputError, match="object 'spoon': the weights do not know it"):
         oracle(moving(1)).track([], CAMERA, "spoon")
 
@@ -337,3 +340,13 @@ def test_files_say_how_an_estimate_came_about() -> None:
     assert "tracking" not in plain
     with pytest.raises(InputError, match="tracking is 'sort of'; write one of"):
         parse_prediction({**row, "tracking": "sort of"}, "here")
+
+
+def test_a_track_follows_its_object_whatever_clouds_name() -> None:
+    parts = [bracket(), bottle()]
+    truth = pose_at()
+    cloud = CloudInput(name="x", points_m=cloud_of(bracket(), truth).float(), object="bracket")
+    tracked = Registration(parts).track([cloud, cloud], object="bottle", first=truth)
+    assert {estimate.object for estimate in tracked} == {"bottle"}
+    found = Registration(parts).track([cloud, cloud], object="bottle")
+    assert {estimate.object for estimate in found} == {"bottle"}

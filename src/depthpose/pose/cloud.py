@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
+from depthpose.core.camera import project
 from depthpose.core.errors import InputError
 from depthpose.pose.config import CloudConfig, EstimateConfig
 from depthpose.pose.refusals import Refused
@@ -85,8 +86,24 @@ def prepare_cloud(
     require_points(readings_m, cloud_config)
     _require_frame_and_unit(pose_input, readings_m, cloud_m, model)
     require_points(cloud_m, cloud_config)
+    if view is not None:
+        _require_in_view(cloud_m, view)
     _require_extent(pose_input, cloud_m, model)
     return ObjectCloud(name=pose_input.name, cloud_m=cloud_m, view=view, is_masked=is_masked)
+
+
+def _require_in_view(cloud_m: Float[Tensor, "m 3"], view: ViewInput) -> None:
+    """Raise :class:`Refused` where most points of a cloud lie outside its own depth image."""
+    height, width = view.depth_m.shape
+    column, row = project(cloud_m.double(), view.K.double()).round().unbind(-1)
+    is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    outside_share = 1 - float(is_inside.double().mean())
+    if outside_share > _MAJORITY:
+        raise Refused(
+            "unusable input",
+            f"{outside_share:.0%} of the points lie outside the {width}x{height} depth image that "
+            "they are given with; give the image and the camera that they were measured by",
+        )
 
 
 def _explain_emptiness(pose_input: CloudInput | ViewInput) -> str:

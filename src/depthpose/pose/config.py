@@ -194,7 +194,7 @@ class EstimateConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.rough_rigidity_diameters < self.voting.rigidity_diameters:
+        if self.with_icp and self.rough_rigidity_diameters < self.voting.rigidity_diameters:
             raise InputError(
                 f"rough_rigidity_diameters is {self.rough_rigidity_diameters}, but the strict one, "
                 f"voting.rigidity_diameters, is {self.voting.rigidity_diameters}; take 0.3"

@@ -157,9 +157,12 @@ class PoseEstimator:
         seconds = seconds_of_all([estimate, in_region])
         return replace(in_region if in_region.is_posed else estimate, seconds=seconds)
 
-    def _search_region(self, view: ViewInput) -> PoseEstimate:
-        """Search the one object that is somewhere in the mask of a view, as in a box."""
-        targets = self._targets([view.object], "one")
+    def _search_region(self, view: ViewInput, *, is_expected: bool = True) -> PoseEstimate:
+        """Search the object of a view in its mask, as in a box.
+
+        ``is_expected``: whether it is there, as :meth:`_estimate` takes it.
+        """
+        targets = self._targets([view.object], "one" if is_expected else "one at most")
         best = find_objects(view, targets)[0]
         return replace(best, name=view.name)
 
@@ -172,7 +175,7 @@ class PoseEstimator:
         if self.needs_mask:
             raise InputError(NEEDS_MASK)
         return SearchTargets(
-            objects={name: self._find_object(name).prepare() for name in names},
+            objects={name: self._find_object(name).prepare(is_searched=True) for name in names},
             config=self.config,
             instances=instances,
         )
@@ -368,7 +371,8 @@ class PoseEstimator:
                 their estimates are taken. Views and clouds that are read already are taken too; in
                 a view only its mask is searched.
             camera: of the depth images.
-            object: which one; None where one alone is known.
+            object: which one, in place of the objects that views and clouds name; None where one
+                alone is known.
             first: the pose in the first frame, as far as it is known, or its 4x4 matrix in metres;
                 None: it is looked for.
             unit: as for :meth:`estimate`.
@@ -401,8 +405,10 @@ class PoseEstimator:
             number: int, frame: AnyArray | AnyInput | PoseEstimate | None
         ) -> AnyInput | PoseEstimate:
             """Read a frame; one that cannot be read is an estimate that says so."""
-            if isinstance(frame, AnyInput | PoseEstimate):
+            if isinstance(frame, PoseEstimate):
                 return frame
+            if isinstance(frame, AnyInput):
+                return replace(frame, object=which)
             name = f"{_NAME}_{number}"
             reason = f"{name}: there is no frame, a None in its place"
             if frame is not None:

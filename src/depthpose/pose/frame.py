@@ -92,6 +92,7 @@ def crop_view(view: ViewInput, window: Window) -> ViewInput:
         mask=view.mask[window],
         K=crop_intrinsics(view.K, left=columns.start, top=rows.start),
         background=background,
+        whole_m=view.depth_m if view.whole_m is None else view.whole_m,
     )
 
 

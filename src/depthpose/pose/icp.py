@@ -17,8 +17,8 @@ from depthpose.pose.compiled import Vector, array_of, compiled, cross, dot, minu
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.geometry.surface import (
     UNOBSERVED_WEIGHT,
+    SampleTree,
     Surface,
-    Target,
     look_along_rays,
     match,
 )
@@ -167,7 +167,7 @@ def icp(
             translations[k],
             np.array(distances_m),
             surface.diameter_m,
-            surface.target,
+            surface.sample_tree,
             is_exact,
             Residuals(jacobian[k], residual_m[k], weight[k]),
         )
@@ -438,7 +438,7 @@ def _gauss_newton(
     t: Float64[np.ndarray, "3"],
     limits: Float64[np.ndarray, " steps"],
     diameter: float,
-    target: Target,
+    target: SampleTree,
     is_exact: bool,
     residuals: Residuals,
 ) -> Float64[np.ndarray, "6 6"]:
@@ -504,7 +504,7 @@ def _gauss_newton(
 def _meet_planes(
     local: Float64[np.ndarray, "n 3"],
     eye: Vector,
-    target: Target,
+    target: SampleTree,
     places: Int64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "n 3"]:
     """Intersect the ray of each point with the plane of its sample, in the model frame.
@@ -542,7 +542,7 @@ def _linearise(
     R: Float64[np.ndarray, "3 3"],
     arm_of_model: Float64[np.ndarray, "3"],
     limit: float,
-    target: Target,
+    target: SampleTree,
     is_along_rays: bool,
     residuals: Residuals,
 ) -> None:

@@ -217,7 +217,7 @@ class GeoPoseNet(PoseEstimator):
         For a region, or an input that is refused, the finished estimate is returned instead.
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
-            return self._search_region(pose_input)
+            return self._search_region(pose_input, is_expected=is_expected)
         target = self._find_object(pose_input.object).prepare()
         watch = Stopwatch()
 
@@ -437,6 +437,7 @@ class DepthImageRegressor(PoseEstimator):
         """
         config = self._network.config
         model = target.model
+        pose_input = replace(pose_input, mask=pose_input.foreground)
 
         # The crop that the network sees, and the pose that it regresses.
         with watch.stage("network"):

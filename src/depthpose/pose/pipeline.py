@@ -115,25 +115,8 @@ def judge(
     # The best pose against its near-symmetric copies, look-alikes and other local minima.
     with watch.stage("evidence"):
         observation = observe(cloud.cloud_m, cloud.view, target.surface, is_masked=cloud.is_masked)
-        has_color = cloud.view is not None and cloud.view.color is not None
-        competition = compete(
-            cloud.cloud_m.double(),
-            refined,
-            others,
-            target,
-            observation,
-            config,
-            cloud.view if has_color else None,
-            votes_rad,
-        )
+        competition = compete(observation, refined, others, target, config, votes_rad)
 
     with watch.stage("decision"):
-        estimate = decide(
-            cloud,
-            target,
-            competition,
-            observation,
-            config=config,
-            is_expected=is_expected,
-        )
-    return replace(estimate, seconds=watch.seconds)
+        estimate = decide(competition, observation, target, config, is_expected=is_expected)
+    return replace(estimate, name=cloud.name, seconds=watch.seconds)

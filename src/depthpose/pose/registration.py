@@ -99,7 +99,7 @@ class Registration(PoseEstimator):
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""
         for name in self.objects:
-            self._find_object(name).prepare()
+            self._find_object(name).prepare(is_searched=True)
 
     def _estimate(
         self,

@@ -384,20 +384,21 @@ def _take_estimate(
     """Give a candidate its estimate; reject what is refused, or lies where no object can be."""
     evidence = estimate.evidence
     if estimate.camera_from_model is None:
+        evidence = evidence or candidate.evidence  # that of its start, if it was refused before
         return replace(candidate, evidence=evidence, rejected=estimate.reason)
     assert evidence is not None, "poses in a view are compared with it"
+    pose = estimate.camera_from_model.double()
+    posed = replace(_move(candidate, pose, evidence, frame, targets), estimate=estimate)
 
     # No object lies in its background.
-    pose = estimate.camera_from_model.double()
     sunk_share = share_in_background(frame, pose, candidate.surface)
     if sunk_share > _MOST_SUNK:
         reason = (
             f"{sunk_share:.0%} of it would lie in the bin, table or wall before which it is seen"
         )
-        return replace(candidate, evidence=evidence, rejected=reason)
+        return replace(posed, rejected=reason)
 
     # The only instance lies in the region that was given.
-    posed = replace(_move(candidate, pose, evidence, frame, targets), estimate=estimate)
     inside_share = float(is_searched[posed.inliers].double().mean())
     if targets.is_single and not inside_share > _LEAST_INSIDE:  # without inliers it is NaN
         return replace(posed, rejected="most of it lies outside the given region")

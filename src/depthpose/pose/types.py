@@ -103,7 +103,7 @@ class ViewInput:
     """A depth image with the mask of one object: what a :class:`CloudInput` is lifted from."""
 
     name: str  #: of the input, its results and their files
-    #: along the optical axis; NaN where there is no reading. May be a window of a larger image.
+    #: along the optical axis; NaN where there is no reading. May be a window of ``whole_m``.
     depth_m: Float[Tensor, "h w"]
     #: the object's pixels, as a segmentation gives them, with errors
     mask: Bool[Tensor, "mask_h mask_w"]
@@ -114,6 +114,8 @@ class ViewInput:
     #: and is not the object is no evidence against a pose.
     is_region: bool = False
     background: KnownBackground | None = None  #: of this view; None: it is not known
+    #: the whole depth image, where this is a window of it: of its sensor it shows more.
+    whole_m: Float[Tensor, "whole_h whole_w"] | None = None
 
     @cached_property
     def foreground(self) -> Bool[Tensor, "h w"]:
@@ -123,7 +125,7 @@ class ViewInput:
     @cached_property
     def shared_per_white(self) -> float:
         """Error that neighbouring readings share, over the noise of one reading."""
-        return measure_shared_per_white(self.depth_m)
+        return measure_shared_per_white(self.depth_m if self.whole_m is None else self.whole_m)
 
 
 AnyInput = CloudInput | ViewInput

@@ -106,7 +106,7 @@ def _look_up_all(
     return values
 
 
-class Target(NamedTuple):
+class SampleTree(NamedTuple):
     """The samples of a surface for compiled loops, in the order of a k-d tree.
 
     The *place* of a sample is its row in this order.
@@ -125,7 +125,7 @@ class Target(NamedTuple):
 @compiled
 def match(
     points: Float64[np.ndarray, "n 3"],
-    target: Target,
+    target: SampleTree,
     eye: Vector,
     least: float,
     limit: float,
@@ -226,7 +226,7 @@ class Surface:
                 ``boxes``: for many poses, or where a distance off by a box is good enough.
         """
         if is_exact:
-            index = find_nearest_points(array_of(local_m).reshape(-1, 3), self.target.tree)
+            index = find_nearest_points(array_of(local_m).reshape(-1, 3), self.sample_tree.tree)
             sample = torch.from_numpy(index).reshape(local_m.shape[:-1])
         else:
             sample = self.boxes.look_up(local_m)
@@ -268,7 +268,7 @@ class Surface:
         )
 
     @cached_property
-    def target(self) -> Target:
+    def sample_tree(self) -> SampleTree:
         """The samples as compiled loops take them.
 
         They are copies: where a surface is sent to another process, torch moves its tensors to
@@ -279,7 +279,7 @@ class Surface:
         place = np.full(len(self.points_m) + 1, -1)
         place[tree.order] = np.arange(len(self.points_m))
         boxes = self.boxes
-        return Target(
+        return SampleTree(
             tree=tree,
             normals=np.ascontiguousarray(self.normals.numpy()[tree.order]),
             # In 32 bits: half of the memory, which is read at random.

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import OTHER_FRAME, ObjectCloud
+from depthpose.pose.cloud import OTHER_FRAME
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.refusals import Refused
 from depthpose.pose.types import Alternative, Evidence, Identity, PoseEstimate
@@ -39,21 +39,19 @@ LEAST_SHARE = 0.8
 
 
 def decide(
-    cloud: ObjectCloud,
-    target: TargetObject,
     competition: Competition,
     observation: Observation,
-    *,
+    target: TargetObject,
     config: EstimateConfig,
+    *,
     is_expected: bool,
 ) -> PoseEstimate:
-    """Return the likeliest of competing poses as the estimate.
+    """Return the likeliest of competing poses as the estimate, still without a name.
 
     Args:
-        cloud: points of the object.
-        target: the object.
-        competition: of its poses.
+        competition: of the poses.
         observation: that they were compared with.
+        target: the object.
         config: of limits; without ICP size and mirror image are not tested.
         is_expected: whether a mask or a detector's box says that the object is there.
 
@@ -66,7 +64,7 @@ def decide(
     free = free_motions(model.symmetries.continuous, best.pose)
 
     # A cloud, other than a depth image, may be in another frame than the camera's.
-    hint = f". {OTHER_FRAME}" if cloud.view is None else ""
+    hint = f". {OTHER_FRAME}" if observation.view is None else ""
 
     # Does the view determine a pose, is it right, and is it of this object?
     measured: dict[str, Any] = {
@@ -74,16 +72,16 @@ def decide(
         "evidence": best.evidence,
     }
     try:
-        require_observable(cloud.cloud_m, target, best.pose, free, config.limits)
+        require_observable(observation.cloud_m, target, best.pose, free, config.limits)
         require_right(best.evidence, probability, config.limits, is_masked=observation.is_masked)
-        identity = _require_identity(cloud, target, best, observation, config)
+        identity = _require_identity(best, observation, target, config)
     except Refused as refused:  # all but the pose, so that nobody takes it for an estimate
         reason = refused.reason + (hint if refused.status == "doubtful" else "")
         measured = {**measured, **refused.measured}
         raise Refused(refused.status, reason, **measured) from refused
 
     estimate = PoseEstimate(
-        name=cloud.name,
+        name="",
         object=model.name,
         status="ok",
         camera_from_model=best.pose.float(),  # computed in double precision
@@ -155,10 +153,9 @@ def require_right(
 
 
 def _require_identity(
-    cloud: ObjectCloud,
-    target: TargetObject,
     best: Hypothesis,
     observation: Observation,
+    target: TargetObject,
     config: EstimateConfig,
 ) -> Identity | None:
     """Raise :class:`Refused` where another size or the mirror image of the object fits better.
@@ -169,16 +166,7 @@ def _require_identity(
     max_size_error = config.limits.max_size_error
     if not config.with_icp or max_size_error >= 1:
         return None
-    identity = identify(
-        cloud.cloud_m,
-        best.pose,
-        target.model.name,
-        target.surface,
-        target.copies.mirror,
-        best.evidence,
-        observation.focal_px,
-        max_size_error,
-    )
+    identity = identify(best, observation, target, max_size_error)
     if identity.status == "contradicted":
         raise Refused("doubtful", identity.reason, identity=identity)
     return identity

@@ -73,6 +73,8 @@ _MARGIN_PX = 4
 class Observation:
     """What a camera observed about an object, in a window of its image, thinned if it is large."""
 
+    cloud_m: Float64[Tensor, "n 3"]  #: points on the object, in the camera frame
+    view: ViewInput | None  #: the depth image that they are of; None of a cloud alone
     depth_m: np.ndarray  #: (h, w), NaN where there is no reading
     is_masked: bool  #: whether a mask says which pixels are of the object
     is_object: np.ndarray  #: (h, w) these pixels, without their border; none without a mask
@@ -87,6 +89,11 @@ class Observation:
     def focal_px(self) -> float:
         """Focal length of the image itself, before it was thinned."""
         return self.step * float(self.K[0, 0])
+
+    @property
+    def colored_view(self) -> ViewInput | None:
+        """The view, where it has a colour image."""
+        return None if self.view is None or self.view.color is None else self.view
 
 
 def observe(
@@ -156,6 +163,8 @@ def observe(
     # The pixels of a drawn cloud are not those of its sensor, whose correlation is then an angle.
     correlation_px = CORRELATION_PX if view is not None else CORRELATION_RAD * float(K[0, 0])
     return Observation(
+        cloud_m=cloud_m,
+        view=view,
         depth_m=np.ascontiguousarray(depth_m.float().numpy()[::step, ::step]),
         is_masked=is_masked,
         is_object=np.ascontiguousarray(inner.numpy()[::step, ::step]) & is_masked,

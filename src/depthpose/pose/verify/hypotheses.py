@@ -69,27 +69,25 @@ class Competition:
 
 
 def compete(
-    cloud_m: Float64[Tensor, "n 3"],
+    observation: Observation,
     refined: PoseFit,
     others: Rigid,
     target: TargetObject,
-    observation: Observation,
     config: EstimateConfig,
-    view: ViewInput | None = None,
     votes_rad: Callable[[Rigid], float] | None = None,
 ) -> Competition:
     """Compare a refined pose with others and its look-alikes, and the winner with its copies.
 
     Args:
-        cloud_m: points of the object, in the camera frame.
+        observation: of the object; a colour image of its view tells copies apart.
         refined: the leading pose.
         others: further poses, refined or only proposed.
         target: the object.
-        observation: of it.
         config: of the refinement; without ICP poses stay where they are.
-        view: whose colour image tells copies apart; None: depth alone.
         votes_rad: mean angle between a network's directions and those to the keypoints of a pose.
     """
+    cloud_m = observation.cloud_m
+    view = observation.colored_view
     is_masked = observation.is_masked
     hypothesize = partial(_hypothesize, target=target, observation=observation, votes_rad=votes_rad)
 
@@ -266,7 +264,7 @@ class _Competitor(NamedTuple):
     """A competing pose, refined and as it was proposed."""
 
     refined: PoseFit
-    unrefined: PoseFit
+    start: Rigid  #: the pose before refinement
 
 
 def _refine_distinct_copies(
@@ -308,22 +306,21 @@ def _settle_copy(
         settled = align_print(refined.camera_from_model, target.model, view)
         refined = replace(refined, camera_from_model=settled)
     copies = target.copies
-    start_pose = start.camera_from_model[None]
-    if copies.is_same(refined.camera_from_model, start_pose, copies.symmetries).any():
+    if copies.is_same(refined.camera_from_model, start[None], copies.symmetries).any():
         return [refined]
     return [_undo_drift(refined, start, copies.near_axis), refined]
 
 
-def _undo_drift(refined: PoseFit, start: PoseFit, axis: Axis | None) -> PoseFit:
+def _undo_drift(refined: PoseFit, start: Rigid, axis: Axis | None) -> PoseFit:
     """Rotate a refined pose about an axis of its model back to the angle at which it started.
 
     Without an axis it is put back to its start, which nothing refined.
     """
     if axis is None:
-        return start
+        return replace(refined, camera_from_model=start)
     pose = refined.camera_from_model.double()
     direction = axis.direction.double()
-    twist_rad = _measure_twist(start.camera_from_model.R.double().mT @ pose.R, direction)
+    twist_rad = _measure_twist(start.R.double().mT @ pose.R, direction)
     back = turn_about(direction, axis.point_m.double(), -twist_rad)
     return replace(refined, camera_from_model=pose @ back)
 
@@ -377,17 +374,29 @@ def _refine_competitors(
     starts: Rigid,
     surface: Surface,
     config: EstimateConfig,
-    most: int,
+    max_count: int,
 ) -> list[_Competitor]:
-    """Refine competing poses, but for those that explain much less than the leading one."""
-    unrefined = [replace(leading, camera_from_model=starts[k]) for k in range(len(starts.R))]
+    """Refine competing poses, but for those that explain much less than the leading one.
+
+    Args:
+        cloud_m: points of the object, in the camera frame.
+        leading: the best pose so far.
+        starts: the poses that compete with it.
+        surface: of the model.
+        config: of the refinement; without ICP all poses compete as they are.
+        max_count: how many are refined at most, those that explain most of the cloud.
+    """
     if not config.with_icp:
-        return [_Competitor(pose, pose) for pose in unrefined]
+        # Their covariance is not known; at copies of the leading pose it is that of the leading.
+        return [
+            _Competitor(replace(leading, camera_from_model=starts[k]), starts[k])
+            for k in range(len(starts.R))
+        ]
     if len(starts.R) == 0:
         return []
 
-    # Roughly. Such steps let a pose drift along what little constrains it, so it stays at its start
-    # where that explains as much.
+    # Roughly. Such steps may move a pose along directions that the points hardly constrain: the
+    # result is taken only where it explains more of the cloud than the start.
     rough = refine_roughly(cloud_m, starts, surface, config.icp.end_distance_diameters)
     unexplained_before = _measure_unexplained(cloud_m, starts, surface)
     unexplained_after = _measure_unexplained(cloud_m, rough, surface)
@@ -402,7 +411,7 @@ def _refine_competitors(
     leading_unexplained = _measure_unexplained(
         cloud_m, leading.camera_from_model.double()[None], surface
     )
-    order = unexplained.argsort(stable=True)[:most]
+    order = unexplained.argsort(stable=True)[:max_count]
     order = order[unexplained[order] <= leading_unexplained + _UNEXPLAINED_MORE]
     if len(order) == 0:
         return []
@@ -418,10 +427,7 @@ def _refine_competitors(
         max_points=min(_POINTS, config.icp.cloud_points),
         sensor_offset_m=config.icp.sensor_offset_m,
     )
-    competitors: list[_Competitor] = []
-    for k, number in enumerate(order.tolist()):
-        competitors.append(_Competitor(batch[k], unrefined[number]))
-    return competitors
+    return [_Competitor(batch[row], starts[start]) for row, start in enumerate(order.tolist())]
 
 
 def _measure_unexplained(

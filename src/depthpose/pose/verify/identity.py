@@ -15,7 +15,7 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import array_of, compiled, cross, dot, minus, vector
-from depthpose.pose.geometry.surface import NEAR, Surface, Target, match
+from depthpose.pose.geometry.surface import NEAR, SampleTree, Surface, match
 from depthpose.pose.icp import (
     Residuals,
     build_normal_equations,
@@ -28,6 +28,9 @@ from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.sensor import EDGE_PX, INDEPENDENT_SIDES, LARGEST_OFFSET_M
 from depthpose.pose.types import Evidence, Identity
+from depthpose.pose.verify.evidence import Observation
+from depthpose.pose.verify.hypotheses import Hypothesis
+from depthpose.pose.verify.target_object import TargetObject
 
 POINTS = 400  #: points of the cloud that are compared, evenly taken
 _ROUGH_POINTS = 150  # of these points, those that compare starts
@@ -104,7 +107,7 @@ def measure_scale(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) 
         float(scale),
         array_of(surface.middle_m),
         surface.near_m,
-        surface.target,
+        surface.sample_tree,
         True,
         np.full(moved_m.shape[1], -1),
     )
@@ -157,7 +160,7 @@ def _fit_scale(
         array_of(surface.middle_m),
         surface.diameter_m,
         limits_m,
-        surface.target,
+        surface.sample_tree,
         is_exact,
     )
     return torch.from_numpy(scales), torch.from_numpy(moved)
@@ -170,7 +173,7 @@ def _grow(
     middle: Float64[np.ndarray, "3"],
     diameter: float,
     limits: Float64[np.ndarray, " steps"],
-    target: Target,
+    target: SampleTree,
     is_exact: bool,
 ) -> None:
     """Take steps of ICP with a scale, until no start moves any more.
@@ -214,7 +217,7 @@ def _linearise_growth(
     scale: float,
     middle: Float64[np.ndarray, "3"],
     limit: float,
-    target: Target,
+    target: SampleTree,
     is_exact: bool,
     places: Int64[np.ndarray, " n"],
 ) -> Residuals:
@@ -355,38 +358,29 @@ class _Fits(NamedTuple):
 
 
 def identify(
-    cloud_m: Float[Tensor, "n 3"],
-    pose: Rigid,
-    name: str,
-    surface: Surface,
-    mirror_deviation: float,
-    evidence: Evidence,
-    focal_px: float,
-    max_size_error: float,
+    best: Hypothesis, observation: Observation, target: TargetObject, max_size_error: float
 ) -> Identity:
     """Check whether a posed object has the size and the handedness of its model.
 
     Args:
-        cloud_m: points of the object, in the camera frame.
-        pose: ``camera_from_model``.
-        name: of the model.
-        surface: of the model.
-        mirror_deviation: of the mirror image from the model, in diameters.
-        evidence: of the pose.
-        focal_px: of the depth image.
-        max_size_error: by so much a real object may differ in size from its model.
+        best: the pose, with its evidence.
+        observation: of the object.
+        target: the object.
+        max_size_error: share by which a real object may differ in size from its model.
     """
     # The best fits of another size and of the mirror image.
-    scale = measure_scale(cloud_m, pose, surface)
-    has_mirror_image = mirror_deviation > MIRROR_ALIKE
-    gain = measure_mirror_gain(cloud_m, pose, surface) if has_mirror_image else None
+    cloud_m = observation.cloud_m
+    surface = target.surface
+    scale = measure_scale(cloud_m, best.pose, surface)
+    has_mirror_image = target.copies.mirror > MIRROR_ALIKE
+    gain = measure_mirror_gain(cloud_m, best.pose, surface) if has_mirror_image else None
 
     # Errors that explain a difference: of the sensor, and of sides that deviate from the model.
-    distance_m = float(cloud_m[:, 2].double().median())
-    sensor_error = _bound_size_error(distance_m, focal_px, surface.diameter_m)
+    distance_m = float(cloud_m[:, 2].median())
+    sensor_error = _bound_size_error(distance_m, observation.focal_px, surface.diameter_m)
     sides_m = surface.deviation_m / math.sqrt(INDEPENDENT_SIDES)
     fits = _Fits(
-        name=name,
+        name=target.model.name,
         scale=scale,
         mirror_gain=gain,
         size_tolerance=max_size_error + sensor_error,
@@ -399,7 +393,7 @@ def identify(
     if reason:
         status = "contradicted"
     else:
-        reason = _explain_unconfirmed(fits, evidence)
+        reason = _explain_unconfirmed(fits, best.evidence)
         status = "not excluded" if reason else "confirmed"
     return Identity(
         status=status,
@@ -450,8 +444,9 @@ def _explain_unconfirmed(fits: _Fits, evidence: Evidence) -> str:
         return f"{_describe_size(scale)}, which a sensor's errors may explain"
     if size_error > max(_NEAR_SIZE, deviation) + fits.offset_error:
         return f"{_describe_size(scale)}, and not that of the model"
-    if evidence.contradicted > 0:
-        share = evidence.contradicted / (evidence.supported + evidence.contradicted)
+    contradicted = evidence.contradicted + evidence.continued
+    if contradicted > 0:
+        share = contradicted / (evidence.supported + contradicted)
         return (
             f"{share:.1%} of what was compared contradicts the model: a similar part, or one that "
             "differs from its file"

@@ -21,12 +21,17 @@ class TargetObject:
     surface_points: int = 10_000  #: samples of its surface
     deviation_m: float | None = None  #: of the real surface, as :func:`prepare_surface` takes it
 
-    def prepare(self) -> "TargetObject":
-        """Compute all parts now, in some seconds, so that the time of no input includes it."""
-        _ = self.surface
+    def prepare(self, *, is_searched: bool = False) -> "TargetObject":
+        """Compute all parts now, in some seconds, so that the time of no input includes it.
+
+        ``is_searched``: also what only a search in an image needs.
+        """
+        _ = self.surface.sample_tree
         _ = self.copies
         if has_surface(self.model):
             _ = self.pairs
+            if is_searched:
+                _ = self.surface.views
         return self
 
     @cached_property
