@@ -32,7 +32,7 @@ from depthpose.pose.types import (
     ViewInput,
 )
 from depthpose.pose.verify.decide import require_observable, require_right, with_status
-from depthpose.pose.verify.evidence import compare, observe
+from depthpose.pose.verify.evidence import Observation, compare, observe
 from depthpose.pose.verify.observability import free_motions, without_motions
 from depthpose.pose.verify.probability import (
     PRIOR_EXPECTED,
@@ -262,9 +262,11 @@ def _follow(
         raise Refused("too few points", reason)
 
     # Is the pose right, and does what is seen of the object determine it?
-    weighed = _weigh_pose(pose_input, object_m, pose, current.log_odds, surface, config.limits)
+    view = pose_input if isinstance(pose_input, ViewInput) else pose_input.view
+    observation = observe(object_m, view, surface, is_masked=False)
+    weighed = _weigh_pose(observation, pose, current.log_odds, surface, config.limits)
     free = free_motions(target.model.symmetries.continuous, pose)
-    require_observable(object_m, target, pose, free, config.limits)
+    require_observable(observation, target, pose, free, config.limits)
 
     # The estimate, and the track that the next frame begins with.
     estimate = PoseEstimate(
@@ -296,8 +298,7 @@ class _WeighedPose(NamedTuple):
 
 
 def _weigh_pose(
-    pose_input: AnyInput,
-    object_m: Float64[Tensor, "n 3"],
+    observation: Observation,
     pose: Rigid,
     log_odds: float,
     surface: Surface,
@@ -306,8 +307,7 @@ def _weigh_pose(
     """Weigh a pose by the evidence of its frame, alone and together with the frames before.
 
     Args:
-        pose_input: the frame.
-        object_m: points that lie on the object at the pose.
+        observation: of the object in the frame.
         pose: ``camera_from_model``.
         log_odds: that the track is right, by the frames before.
         surface: of the model.
@@ -317,12 +317,6 @@ def _weigh_pose(
         Refused: the pose is doubtful, by this frame or by all.
     """
     # By this frame alone.
-    observation = observe(
-        object_m,
-        pose_input if isinstance(pose_input, ViewInput) else pose_input.view,
-        surface,
-        is_masked=False,
-    )
     evidence = compare(observation, pose, surface)
     probability = probability_right(evidence, is_expected=True)
     require_right(evidence, probability, limits, is_masked=False)

@@ -1,6 +1,5 @@
 """How far a moved surface lies off itself, and the motion that fits it best."""
 
-import math
 from functools import lru_cache
 
 import numpy as np
@@ -14,8 +13,9 @@ from depthpose.core.rigid import Rigid, fit_rigid
 from depthpose.pose.mesh.models import sample_surface
 from depthpose.pose.types import ObjectModel
 
-EXACT_SHARE = 0.998
-"""Share of the surface within ``EXACT_DEVIATION``; a key or a notch is a few percent of it."""
+EXACT_SHARE = 0.9995
+"""Share of the surface within ``EXACT_DEVIATION``: a key or a notch is a few percent of it, a hole
+in a long profile two thousandths."""
 _USUAL_SHARE = 0.98  # of the points: the farthest of a scan are stray
 _SAMPLES = 20_000  # of the surface: spaced by about a hundredth of the diameter
 _NEAREST_SAMPLES = 4  # of the surface, that are compared with a point in an exact measure
@@ -41,9 +41,12 @@ class SurfaceDeviation:
         self.axes = torch.linalg.eigh(self.points.T @ self.points).eigenvectors.T
         self.compared_points = take_evenly(self.points, 1000)  #: some of them, which are moved
         self._few_points = take_evenly(self.points, 100)  # to measure thousands of rotations
-        self._dense_points = take_evenly(self.points, 5000)  # for exact measures
+        self._dense_points = take_evenly(self.points, 10_000)  # for exact measures
         self._normals = normals.double().numpy()
         self._tree = KDTree(self.points.numpy())
+        # About the largest distance of neighbours: that to the fourth one.
+        neighbours, _ = self._tree.query(self.compared_points.numpy(), k=5)
+        self._spacing = float(np.median(neighbours[:, 4]))
         self._rough_tree = KDTree(take_evenly(self.points, 2500).numpy())  # a fast, coarse one
 
     def find_nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
@@ -97,10 +100,9 @@ class SurfaceDeviation:
         # Between samples the distance is that to the tangent plane, beside an edge that to the
         # sample. The least of several samples counts, since the nearest one may lie on the other
         # side of an edge.
-        spacing = 2.0 / math.sqrt(len(self.points))  # about the largest of samples, in diameters
         gap = moved[..., None, :] - self.points.numpy()[index]
         height = np.abs((gap * self._normals[index]).sum(-1))
-        beside = np.maximum(distance - spacing, 0)
+        beside = np.maximum(distance - self._spacing, 0)
         distance_to_surface = np.maximum(height, beside).min(-1)
         return torch.from_numpy(distance_to_surface).quantile(share, dim=-1)
 

@@ -22,6 +22,8 @@ EXACT_DEVIATION = 0.004
 """Deviation in diameters up to which a symmetry that was found in a shape is exact: as much as a
 cylinder of 25 facets deviates. A copy that deviates by more, as a scan's dents or a keyway do, is
 another pose, though a view may not tell which."""
+_EXACT_DEVIATION_M = 0.002
+"""The same in metres: a large part has details that are small beside its diameter."""
 _NEAR_TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
@@ -79,7 +81,7 @@ def true_symmetries(model: ObjectModel) -> Symmetries:
     """Select the symmetries of a model whose copies count as one pose.
 
     These are all that were declared. Of those that were found in the geometry, near-symmetries,
-    whose copies deviate by more than ``EXACT_DEVIATION``, are left out.
+    whose copies deviate by more than ``EXACT_DEVIATION`` and 2 mm allow, are left out.
     """
     if not model.symmetries.is_found:
         return model.symmetries
@@ -109,7 +111,8 @@ def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     """
     # Symmetries that were found, and rotations that nearly are some.
     surface = sample_deviation(model)
-    exactness = _measure_exactness(model.symmetries, surface)
+    limit = min(EXACT_DEVIATION, _EXACT_DEVIATION_M / model.diameter_m)
+    exactness = _measure_exactness(model.symmetries, surface, limit)
     candidates = _measure_deviations(_propose_motions(model.symmetries, surface), surface)
 
     # Products of the best candidates are candidates too: a can upside down, then about its axis.
@@ -135,17 +138,22 @@ def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     return {"near": near, "exact": exactness}
 
 
-def _measure_exactness(symmetries: Symmetries, surface: SurfaceDeviation) -> _Exactness:
-    """Measure which discrete symmetries, and which axes, have copies that lie on the surface."""
+def _measure_exactness(
+    symmetries: Symmetries, surface: SurfaceDeviation, limit: float
+) -> _Exactness:
+    """Measure which discrete symmetries, and which axes, have copies that lie on the surface.
+
+    ``limit``: their largest deviation, in diameters.
+    """
     discrete: list[bool] = []
     if symmetries.discrete is not None:
         R = symmetries.discrete.R.double()
-        discrete = (surface.deviation(R, share=EXACT_SHARE) <= EXACT_DEVIATION).tolist()
+        discrete = (surface.deviation(R, share=EXACT_SHARE) <= limit).tolist()
     continuous: list[bool] = []
     for axis in symmetries.continuous:
         R = rotations_about(axis.direction.double(), _CIRCLE_RAD)
         worst = float(surface.deviation(R, share=EXACT_SHARE).max())
-        continuous.append(worst <= EXACT_DEVIATION)
+        continuous.append(worst <= limit)
     return _Exactness(discrete, continuous)
 
 

@@ -34,6 +34,8 @@ _SUPPRESSION_RAD = 0.25  # angle up to which a rotation is that of a better one
 _TEETH = range(13, 61)  # orders of which one step is tried: gears and knurls
 _TOOTH_CONTRAST = 0.004  # diameters by which a rotation between teeth must deviate more
 
+_LARGEST_TOLERANCE_M = 0.005
+"""Largest tolerance of a symmetry: a long part has sides that are small beside its length."""
 _SURE = 0.5  # certainty from which a proposal is accepted: that of a deviation of the tolerance
 _MOST_GROUP = 2 * max(_TEETH)  # of a wheel whose sides are alike; an icosahedron has 60
 _SAME_STEPS = 0.4  # share of the smallest rotation up to which two rotations are the same
@@ -64,11 +66,12 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
 
     Args:
         model: the object.
-        tolerance: deviation in diameters at which the certainty is one half.
+        tolerance: deviation in diameters at which the certainty is one half; 5 mm at most.
 
     Returns:
         Proposals of a certainty of 1/5 and more, continuous first, then the surest.
     """
+    tolerance = min(tolerance, _LARGEST_TOLERANCE_M / model.diameter_m)
     surface = sample_deviation(model)
     proposals: list[SymmetryProposal] = []
     tried_axes: list[Tensor] = []

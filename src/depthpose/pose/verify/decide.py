@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import OTHER_FRAME
@@ -26,6 +27,7 @@ from depthpose.pose.verify.probability import (
     probability_right,
     share_among_objects,
 )
+from depthpose.pose.verify.sliding import is_fixed_by_image
 from depthpose.pose.verify.target_object import TargetObject
 
 _HIDDEN_WEIGHT = 0.5
@@ -72,7 +74,7 @@ def decide(
         "evidence": best.evidence,
     }
     try:
-        require_observable(observation.cloud_m, target, best.pose, free, config.limits)
+        require_observable(observation, target, best.pose, free, config.limits)
         require_right(best.evidence, probability, config.limits, is_masked=observation.is_masked)
         identity = _require_identity(best, observation, target, config)
     except Refused as refused:  # all but the pose, so that nobody takes it for an estimate
@@ -100,7 +102,7 @@ def decide(
 
 
 def require_observable(
-    cloud_m: Float[Tensor, "n 3"],
+    observation: Observation,
     target: TargetObject,
     pose: Rigid,
     free: Float[Tensor, "k 6"],
@@ -109,10 +111,11 @@ def require_observable(
     """Raise :class:`Refused` where a view leaves a motion beside the free ones undetermined.
 
     The rotation about an axis of near-symmetry may stay undetermined: the copies about it are named
-    as alternatives.
+    as alternatives. A shift that moves the surface within itself is determined where an end or a
+    hole is seen (:func:`~depthpose.pose.verify.sliding.is_fixed_by_image`).
 
     Args:
-        cloud_m: points of the object, in the camera frame.
+        observation: of the object.
         target: the object.
         pose: of it.
         free: motions of declared symmetries, by
@@ -122,13 +125,18 @@ def require_observable(
     near_axis = target.copies.near_axis
     if near_axis is not None:
         free = torch.cat([free, free_motions((near_axis,), pose)])
-    observed = observability(cloud_m, pose, target.surface, free)
+    observed = observability(observation.cloud_m, pose, target.surface, free)
     if observed is None:
         raise Refused("doubtful", "too few points lie on the posed surface to determine a pose")
     observable, weakest = observed
     if observable >= limits.min_observability:
         return
-    motion = "rotation" if float(weakest[:3].norm()) > math.sqrt(0.5) else "shift"
+    motion = "rotation"
+    if float(weakest[:3].norm()) <= math.sqrt(0.5):
+        motion = "shift"
+        direction = normalize(weakest[3:], dim=0)
+        if is_fixed_by_image(pose, direction, observation, target.surface):
+            return
     raise Refused(
         "not observable",
         f"the visible part of the object leaves one {motion} undetermined: it moves the "

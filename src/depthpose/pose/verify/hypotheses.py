@@ -25,6 +25,7 @@ from depthpose.pose.verify.probability import (
     log_likelihood_of_copy,
     log_likelihood_ratio,
 )
+from depthpose.pose.verify.sliding import slide
 from depthpose.pose.verify.target_object import TargetObject
 
 _POINTS = 250  # points of the cloud that refine a competing pose
@@ -89,7 +90,9 @@ def compete(
     cloud_m = observation.cloud_m
     view = observation.colored_view
     is_masked = observation.is_masked
-    hypothesize = partial(_hypothesize, target=target, observation=observation, votes_rad=votes_rad)
+    hypothesize = partial(
+        _hypothesize, target=target, observation=observation, config=config, votes_rad=votes_rad
+    )
 
     # First round: which pose is it, up to near-symmetric copies? Each pose stands for its copies,
     # one of which may have the surface colours that are observed.
@@ -130,13 +133,21 @@ def _hypothesize(
     refined: PoseFit,
     target: TargetObject,
     observation: Observation,
+    config: EstimateConfig,
     votes_rad: Callable[[Rigid], float] | None,
 ) -> Hypothesis:
-    """Compare a refined pose with the depth that was observed, and with a network's votes."""
+    """Compare a refined pose with the depth that was observed, and with a network's votes.
+
+    Where its points let it slide, it is compared where the image fits it best.
+    """
     pose = refined.camera_from_model.double()
+    evidence = compare(observation, pose, target.surface)
+    if config.with_icp:
+        refined, evidence = slide(refined, evidence, observation, target.surface)
+        pose = refined.camera_from_model.double()
     return Hypothesis(
         refined=refined,
-        evidence=compare(observation, pose, target.surface),
+        evidence=evidence,
         votes_rad=None if votes_rad is None else votes_rad(pose),
     )
 

@@ -1,0 +1,148 @@
+"""A pose slid to where the image fits it best, along directions that its points do not fix.
+
+ICP compares points with the surface: a long profile may slide along itself while its points stay on
+it. Where it ends, and where its holes are, shows in the image alone: there the camera saw through
+the posed surface, or readings of the object lie beside it.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.rigid import Rigid
+from depthpose.pose.geometry.surface import Surface
+from depthpose.pose.types import Evidence, PoseFit
+from depthpose.pose.verify.evidence import Observation, compare
+from depthpose.pose.verify.probability import LEAST_AGREEMENT, LEAST_AREA, log_likelihood_of_copy
+
+_POINTS = 1000  # of the cloud, by which directions are judged
+_LEAST_FIXED = 0.3
+"""Root mean square component of the observed normals along a direction, from which the points fix
+the pose along it."""
+_REACH_DIAMETERS = 0.1
+"""Largest shift, to either side."""
+_COARSE_STEPS = 10
+_FINE_STEPS = 5
+"""Steps to each side: of the reach, and of one coarse step."""
+_FIXED_DIAMETERS = 0.05
+"""Shift by which an image that fixes a pose contradicts it."""
+_FIXED_PATCHES = 1.0
+"""Independent patches by which it contradicts the shifted pose more."""
+_BETTER = 0.02
+"""Log likelihood by which a place must be better; places that differ by less fit equally well."""
+
+
+def slide(
+    fit: PoseFit, evidence: Evidence, observation: Observation, surface: Surface
+) -> tuple[PoseFit, Evidence]:
+    """Slide a pose along directions that its points do not fix, if the image contradicts it.
+
+    Args:
+        fit: the pose, refined by ICP.
+        evidence: of it.
+        observation: of the object.
+        surface: of the model.
+
+    Returns:
+        The pose in the middle of the places that fit the image best, with their extent as its
+        deviation, and the evidence of it; both as they were where no place is better, or where so
+        much contradicts the pose that it is wrong in another way.
+    """
+    if evidence.contradicted == 0 or evidence.agreement < LEAST_AGREEMENT:
+        return fit, evidence
+    for direction in _find_free_directions(fit.camera_from_model.double(), observation, surface):
+        fit, evidence = _slide_along(direction, fit, evidence, observation, surface)
+    return fit, evidence
+
+
+def _find_free_directions(
+    pose: Rigid, observation: Observation, surface: Surface
+) -> list[Float64[Tensor, "3"]]:
+    """Find directions across which few observed normals point, in the camera frame.
+
+    Returns:
+        Unit vectors, that of the smallest components first: two of a plate, one of a profile.
+    """
+    points_m = pose.inverse().apply(take_evenly(observation.cloud_m, _POINTS))
+    nearest = surface.nearest(points_m, is_exact=False)
+    normals = surface.normals[nearest.sample][nearest.distance_m < surface.near_m] @ pose.R.mT
+    if len(normals) == 0:
+        return []
+    squares, directions = torch.linalg.eigh(normals.T @ normals / len(normals))
+    return [directions[:, k] for k in range(2) if float(squares[k]) < _LEAST_FIXED**2]
+
+
+def _slide_along(
+    direction: Float64[Tensor, "3"],
+    fit: PoseFit,
+    evidence: Evidence,
+    observation: Observation,
+    surface: Surface,
+) -> tuple[PoseFit, Evidence]:
+    """Slide a pose along a direction; arguments and result are those of :func:`slide`."""
+    pose = fit.camera_from_model.double()
+    area = max(LEAST_AREA, evidence.visible)
+
+    def compare_at(shift_m: float) -> Evidence:
+        """Compare the shifted pose with the image."""
+        return compare(observation, Rigid(pose.R, pose.t_m + shift_m * direction), surface)
+
+    # Coarsely, then finely about the best place.
+    reach_m = _REACH_DIAMETERS * surface.diameter_m
+    step_m = reach_m / _COARSE_STEPS
+    coarse_m = torch.linspace(-reach_m, reach_m, 2 * _COARSE_STEPS + 1).tolist()
+    coarse = [log_likelihood_of_copy(compare_at(shift_m), area) for shift_m in coarse_m]
+    best = max(coarse)
+    if best <= log_likelihood_of_copy(evidence, area) + _BETTER:
+        return fit, evidence
+    around_m = torch.linspace(-step_m, step_m, 2 * _FINE_STEPS + 1)
+    fine_m = (coarse_m[coarse.index(best)] + around_m).tolist()
+    fine = [log_likelihood_of_copy(compare_at(shift_m), area) for shift_m in fine_m]
+
+    # Edges are not compared, so that several places fit equally well.
+    least = max(fine) - _BETTER
+    equal_m = [shift_m for shift_m, fitness in zip(fine_m, fine, strict=True) if fitness >= least]
+    middle_m = (equal_m[0] + equal_m[-1]) / 2
+    deviation_m = (equal_m[-1] - equal_m[0]) / 2 + step_m / _FINE_STEPS
+    slid = replace(
+        fit,
+        camera_from_model=Rigid(pose.R, pose.t_m + middle_m * direction),
+        covariance=_set_deviation(fit.covariance, direction, deviation_m),
+    )
+    return slid, compare_at(middle_m)
+
+
+def _set_deviation(
+    covariance: Float[Tensor, "6 6"], direction: Float64[Tensor, "3"], deviation_m: float
+) -> Float[Tensor, "6 6"]:
+    """Set the standard deviation of a pose's translation along a direction."""
+    along = torch.cat([torch.zeros(3, dtype=torch.float64), direction])
+    others = torch.eye(6, dtype=torch.float64) - torch.outer(along, along)
+    others_covariance = others @ covariance.double() @ others
+    return (others_covariance + deviation_m**2 * torch.outer(along, along)).to(covariance)
+
+
+def is_fixed_by_image(
+    pose: Rigid, direction: Float64[Tensor, "3"], observation: Observation, surface: Surface
+) -> bool:
+    """Whether the image contradicts a pose more where it is shifted either way along a direction.
+
+    Args:
+        pose: ``camera_from_model``.
+        direction: unit vector, in the camera frame.
+        observation: of the object.
+        surface: of the model.
+    """
+    contradicted: list[float] = []
+    for shift_m in (
+        0.0,
+        -_FIXED_DIAMETERS * surface.diameter_m,
+        _FIXED_DIAMETERS * surface.diameter_m,
+    ):
+        shifted = Rigid(pose.R, pose.t_m + shift_m * direction)
+        evidence = compare(observation, shifted, surface)
+        contradicted.append(evidence.contradicted + evidence.continued)
+    return min(contradicted[1:]) >= contradicted[0] + _FIXED_PATCHES
