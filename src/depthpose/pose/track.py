@@ -266,7 +266,8 @@ def _follow(
     observation = observe(object_m, view, surface, is_masked=False)
     weighed = _weigh_pose(observation, pose, current.log_odds, surface, config.limits)
     free = free_motions(target.model.symmetries.continuous, pose)
-    require_observable(observation, target, pose, free, config.limits)
+    fixed = require_observable(observation, target, pose, free, config.limits)
+    covariance = refined.covariance if fixed is None else fixed.limit(refined.covariance)
 
     # The estimate, and the track that the next frame begins with.
     estimate = PoseEstimate(
@@ -274,7 +275,7 @@ def _follow(
         object=target.model.name,
         status="ok",
         camera_from_model=refined.camera_from_model.float(),
-        covariance=without_motions(refined.covariance, free).float(),
+        covariance=without_motions(covariance, free).float(),
         free_motions=free.float(),
         residual_m=float(refined.residual_m),
         evidence=weighed.evidence,

@@ -27,7 +27,7 @@ from depthpose.pose.verify.probability import (
     probability_right,
     share_among_objects,
 )
-from depthpose.pose.verify.sliding import is_fixed_by_image
+from depthpose.pose.verify.sliding import FixedShift, find_fixed_shift
 from depthpose.pose.verify.target_object import TargetObject
 
 _HIDDEN_WEIGHT = 0.5
@@ -74,7 +74,7 @@ def decide(
         "evidence": best.evidence,
     }
     try:
-        require_observable(observation, target, best.pose, free, config.limits)
+        fixed = require_observable(observation, target, best.pose, free, config.limits)
         require_right(best.evidence, probability, config.limits, is_masked=observation.is_masked)
         identity = _require_identity(best, observation, target, config)
     except Refused as refused:  # all but the pose, so that nobody takes it for an estimate
@@ -82,12 +82,15 @@ def decide(
         measured = {**measured, **refused.measured}
         raise Refused(refused.status, reason, **measured) from refused
 
+    covariance = best.refined.covariance
+    if fixed is not None:
+        covariance = fixed.limit(covariance)
     estimate = PoseEstimate(
         name="",
         object=model.name,
         status="ok",
         camera_from_model=best.pose.float(),  # computed in double precision
-        covariance=without_motions(best.refined.covariance, free).float(),
+        covariance=without_motions(covariance, free).float(),
         free_motions=free.float(),
         certainty=probability * competition.group_share,
         copy_certainty=probability * competition.best_share,
@@ -107,12 +110,12 @@ def require_observable(
     pose: Rigid,
     free: Float[Tensor, "k 6"],
     limits: RefusalConfig,
-) -> None:
+) -> FixedShift | None:
     """Raise :class:`Refused` where a view leaves a motion beside the free ones undetermined.
 
     The rotation about an axis of near-symmetry may stay undetermined: the copies about it are named
     as alternatives. A shift that moves the surface within itself is determined where an end or a
-    hole is seen (:func:`~depthpose.pose.verify.sliding.is_fixed_by_image`).
+    hole is seen.
 
     Args:
         observation: of the object.
@@ -121,6 +124,9 @@ def require_observable(
         free: motions of declared symmetries, by
             :func:`~depthpose.pose.verify.observability.free_motions`.
         limits: the least share by which every other motion must move the visible surface.
+
+    Returns:
+        A shift that the image determines alone; None where the points determine all.
     """
     near_axis = target.copies.near_axis
     if near_axis is not None:
@@ -130,13 +136,14 @@ def require_observable(
         raise Refused("doubtful", "too few points lie on the posed surface to determine a pose")
     observable, weakest = observed
     if observable >= limits.min_observability:
-        return
+        return None
     motion = "rotation"
     if float(weakest[:3].norm()) <= math.sqrt(0.5):
         motion = "shift"
         direction = normalize(weakest[3:], dim=0)
-        if is_fixed_by_image(pose, direction, observation, target.surface):
-            return
+        fixed = find_fixed_shift(pose, direction, observation, target.surface)
+        if fixed is not None:
+            return fixed
     raise Refused(
         "not observable",
         f"the visible part of the object leaves one {motion} undetermined: it moves the "

@@ -11,7 +11,7 @@ round a corner of one body, contradicts the pose too: it lies on something large
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -89,6 +89,20 @@ class Observation:
     def focal_px(self) -> float:
         """Focal length of the image itself, before it was thinned."""
         return self.step * float(self.K[0, 0])
+
+    def in_units_of(self, length_m: float) -> "Observation":
+        """Measure all depths and deviations in another unit of length, as if it were a metre.
+
+        A model of its own size then looks as one ``length_m`` times as large does here.
+        """
+        noise = DepthNoise(
+            white_std_m=self.noise.white_std_m / length_m,
+            shared_std_m=self.noise.shared_std_m / length_m,
+            lateral_std_m=self.noise.lateral_std_m / length_m,
+            object_std_m=self.noise.object_std_m / length_m,
+        )
+        depth_m = (self.depth_m / length_m).astype(self.depth_m.dtype)
+        return replace(self, depth_m=depth_m, cloud_m=self.cloud_m / length_m, noise=noise)
 
     @property
     def colored_view(self) -> ViewInput | None:

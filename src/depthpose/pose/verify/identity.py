@@ -13,7 +13,7 @@ from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, fit_rigid
 from depthpose.pose.compiled import array_of, compiled, cross, dot, minus, vector
 from depthpose.pose.geometry.surface import NEAR, SampleTree, Surface, match
 from depthpose.pose.icp import (
@@ -28,8 +28,9 @@ from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.sensor import EDGE_PX, INDEPENDENT_SIDES, LARGEST_OFFSET_M
 from depthpose.pose.types import Evidence, Identity
-from depthpose.pose.verify.evidence import Observation
+from depthpose.pose.verify.evidence import Observation, compare
 from depthpose.pose.verify.hypotheses import Hypothesis
+from depthpose.pose.verify.probability import LEAST_AREA, log_likelihood_of_copy
 from depthpose.pose.verify.target_object import TargetObject
 
 POINTS = 400  #: points of the cloud that are compared, evenly taken
@@ -72,7 +73,9 @@ class Scale:
     """How many times as large as the model the observed object is, and how certain that is."""
 
     times: float  #: 1 for the model itself
-    sigma: float  #: standard deviation of it
+    #: ``camera_from_model`` of a model that is so many times as large about its origin.
+    pose: Rigid
+    sigma: float  #: standard deviation of ``times``
     #: how much it lowers the root mean square distance of the points to the surface, in limits of
     #: nearness (``NEAR`` of the diameter).
     gain: float
@@ -112,7 +115,13 @@ def measure_scale(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) 
         np.full(moved_m.shape[1], -1),
     )
     sigma = _estimate_scale_deviation(residuals, surface.deviation_m)
-    return Scale(float(scale), sigma, float(gain))
+
+    # The points were moved in place of the surface, which grew about its middle.
+    moved_from_local = fit_rigid(local_m, moved_m[0], torch.ones(len(local_m)).double())
+    grown = pose.double() @ moved_from_local.inverse()
+    origin_m = (1 - scale) * surface.middle_m  # of the model, moved as it grows
+    grown = Rigid(grown.R, grown.apply(origin_m[None])[0])
+    return Scale(times=float(scale), pose=grown, sigma=sigma, gain=float(gain))
 
 
 def _estimate_scale_deviation(residuals: Residuals, object_std_m: float) -> float:
@@ -351,6 +360,7 @@ class _Fits(NamedTuple):
 
     name: str  #: of the model
     scale: Scale  #: that fits best
+    is_size_seen: bool  #: whether the image fits the model of this size better than its own
     mirror_gain: float | None  #: None where the mirror image is the model itself
     size_tolerance: float  #: share by which a right object may seem to differ in size
     mirror_tolerance: float  #: gain of the mirror image that deviating sides explain
@@ -382,6 +392,7 @@ def identify(
     fits = _Fits(
         name=target.model.name,
         scale=scale,
+        is_size_seen=_is_size_seen(scale, best, observation, surface),
         mirror_gain=gain,
         size_tolerance=max_size_error + sensor_error,
         mirror_tolerance=sides_m / surface.near_m,
@@ -389,6 +400,7 @@ def identify(
     )
 
     # What they say of the object.
+    is_size_measured = fits.is_size_seen or scale.gain <= _SIZE_GAIN
     reason = _explain_contradiction(fits)
     if reason:
         status = "contradicted"
@@ -397,18 +409,37 @@ def identify(
         status = "not excluded" if reason else "confirmed"
     return Identity(
         status=status,
-        size=scale.times,
-        size_deviation=scale.sigma,
+        size=scale.times if is_size_measured else None,
+        size_deviation=scale.sigma if is_size_measured else None,
         mirror_gain=None if gain is None else NEAR * gain,
         reason=reason,
     )
+
+
+def _is_size_seen(
+    scale: Scale, best: Hypothesis, observation: Observation, surface: Surface
+) -> bool:
+    """Whether the image fits the model of another size better than that of its own.
+
+    Points beside an object lie near a larger model too, beyond which the camera then sees.
+    """
+    evidence = compare(
+        observation.in_units_of(scale.times),
+        Rigid(scale.pose.R, scale.pose.t_m / scale.times),
+        surface,
+    )
+    area = max(LEAST_AREA, evidence.visible, best.evidence.visible)
+    own = log_likelihood_of_copy(best.evidence, area)
+    return log_likelihood_of_copy(evidence, area) > own
 
 
 def _explain_contradiction(fits: _Fits) -> str:
     """Explain which other fit is clearly better than that of the model; empty where none is."""
     scale = fits.scale
     largest_error = fits.size_tolerance + _DEVIATIONS * scale.sigma
-    is_other_size = abs(scale.times - 1) > largest_error and scale.gain > _SIZE_GAIN
+    is_other_size = (
+        abs(scale.times - 1) > largest_error and scale.gain > _SIZE_GAIN and fits.is_size_seen
+    )
 
     # Where both another size and the mirror image fit better, the one that gains more is named.
     size_gain = scale.gain if is_other_size else 0.0
@@ -441,7 +472,10 @@ def _explain_unconfirmed(fits: _Fits, evidence: Evidence) -> str:
 
     # And is it the model's own size, with nothing that contradicts it?
     if scale.gain > _SIZE_GAIN:
-        return f"{_describe_size(scale)}, which a sensor's errors may explain"
+        cause = "which a sensor's errors may explain"
+        if not fits.is_size_seen:
+            cause = "but not the image: points beside an object lie near a larger model too"
+        return f"{_describe_size(scale)}, {cause}"
     if size_error > max(_NEAR_SIZE, deviation) + fits.offset_error:
         return f"{_describe_size(scale)}, and not that of the model"
     contradicted = evidence.contradicted + evidence.continued

@@ -6,6 +6,7 @@ the posed surface, or readings of the object lie beside it.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Float64
@@ -27,8 +28,8 @@ _REACH_DIAMETERS = 0.1
 _COARSE_STEPS = 10
 _FINE_STEPS = 5
 """Steps to each side: of the reach, and of one coarse step."""
-_FIXED_DIAMETERS = 0.05
-"""Shift by which an image that fixes a pose contradicts it."""
+_FIXED_DIAMETERS = (0.0125, 0.025, 0.05)
+"""Shifts by one of which an image that fixes a pose contradicts it."""
 _FIXED_PATCHES = 1.0
 """Independent patches by which it contradicts the shifted pose more."""
 _BETTER = 0.02
@@ -125,24 +126,41 @@ def _set_deviation(
     return (others_covariance + deviation_m**2 * torch.outer(along, along)).to(covariance)
 
 
-def is_fixed_by_image(
+class FixedShift(NamedTuple):
+    """A shift of a pose that its points leave free, and the image does not."""
+
+    direction: Float64[Tensor, "3"]  #: unit vector, in the camera frame
+    deviation_m: float  #: standard deviation of the pose along it
+
+    def limit(self, covariance: Float[Tensor, "6 6"]) -> Float[Tensor, "6 6"]:
+        """Return the covariance of a pose with this deviation along the direction."""
+        return _set_deviation(covariance, self.direction, self.deviation_m)
+
+
+def find_fixed_shift(
     pose: Rigid, direction: Float64[Tensor, "3"], observation: Observation, surface: Surface
-) -> bool:
-    """Whether the image contradicts a pose more where it is shifted either way along a direction.
+) -> FixedShift | None:
+    """Find how far a pose may shift along a direction until the image contradicts it more.
 
     Args:
         pose: ``camera_from_model``.
         direction: unit vector, in the camera frame.
         observation: of the object.
         surface: of the model.
+
+    Returns:
+        The shift that the image contradicts either way; None where it does so for none.
     """
-    contradicted: list[float] = []
-    for shift_m in (
-        0.0,
-        -_FIXED_DIAMETERS * surface.diameter_m,
-        _FIXED_DIAMETERS * surface.diameter_m,
-    ):
+
+    def count_contradicting(shift_m: float) -> float:
+        """Count the patches that contradict the shifted pose."""
         shifted = Rigid(pose.R, pose.t_m + shift_m * direction)
         evidence = compare(observation, shifted, surface)
-        contradicted.append(evidence.contradicted + evidence.continued)
-    return min(contradicted[1:]) >= contradicted[0] + _FIXED_PATCHES
+        return evidence.contradicted + evidence.continued
+
+    limit = count_contradicting(0.0) + _FIXED_PATCHES
+    for diameters in _FIXED_DIAMETERS:
+        shift_m = diameters * surface.diameter_m
+        if min(count_contradicting(-shift_m), count_contradicting(shift_m)) >= limit:
+            return FixedShift(direction, shift_m)
+    return None
