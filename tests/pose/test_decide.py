@@ -71,7 +71,7 @@ def test_the_seconds_of_several_tries_add_up() -> None:
 def test_each_kind_of_contradiction_lowers_the_probability() -> None:
     right = probability_right(GOOD, is_expected=True)
     assert right > 0.99
-    for kind in ("seen_through", "bulging", "beside", "continued"):
+    for kind in ("seen_through", "bulging", "beside"):
         before = right
         evidence = GOOD
         for patches in (2.0, 8.0, 20.0):

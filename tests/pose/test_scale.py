@@ -24,6 +24,7 @@ from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.icp import refine_exactly
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import PoseEstimate
+from depthpose.pose.verify import identity
 from depthpose.pose.verify.identity import Scale, _fit_scale, measure_scale
 
 TRUTH = pose_at(seed=1)
@@ -108,22 +109,25 @@ def test_a_copy_of_another_size_is_contradicted_with_its_size() -> None:
 def test_an_identity_is_confirmed_where_the_size_that_fits_is_near(
     times: float, status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scale = Scale(times, sigma=0.01, gain=0.03)
+    scale = Scale(times=times, pose=TRUTH.double(), sigma=0.01, gain=0.03)
     monkeypatch.setattr("depthpose.pose.verify.identity.measure_scale", lambda *_: scale)
-    identity = estimated(1.0).identity
-    assert identity is not None
-    assert identity.status == status
-    assert identity.reason.endswith(", and not that of the model") == (status == "not excluded")
+    found = estimated(1.0).identity
+    assert found is not None
+    assert found.status == status
+    assert found.reason.endswith(", and not that of the model") == (status == "not excluded")
 
 
-@pytest.mark.parametrize(("gain", "status"), [(0.03, "ok"), (0.07, "doubtful")])
-def test_another_size_refuses_where_it_fits_clearly_better(
-    gain: float, status: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("gain", "is_seen", "status"),
+    [(0.03, True, "ok"), (0.07, False, "ok"), (0.07, True, "doubtful")],
+)
+def test_another_size_refuses_where_it_fits_clearly_better_in_the_image_too(
+    gain: float, is_seen: bool, status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is seen of a bowl from above fits at many sizes: one that gains little says nothing."""
-    monkeypatch.setattr(
-        "depthpose.pose.verify.identity.measure_scale", lambda *_: Scale(1.2, 0.02, gain)
-    )
+    scale = Scale(times=1.2, pose=TRUTH.double(), sigma=0.02, gain=gain)
+    monkeypatch.setattr(identity, "measure_scale", lambda *_: scale)
+    monkeypatch.setattr(identity, "_is_size_seen", lambda *_: is_seen)
     found = estimated(1.0)
     assert found.status == status
     assert found.identity is not None

@@ -33,6 +33,7 @@ _STEPS = 6  # steps of ICP for poses that were refined roughly
 _SHARE_POINTS = 1000  # points of the cloud that measure what a pose leaves unexplained
 _UNEXPLAINED_MORE = 0.25
 """A competing pose that leaves by so much more of the readings unexplained is not compared."""
+_LEAST_SLID = 0.005  # share from which a pose slides
 _MOST_LEADING = 8  # largest number of different poses that are compared
 _MOST_COPIES = 45  # and of near-symmetric copies of the best of them
 
@@ -90,14 +91,15 @@ def compete(
     cloud_m = observation.cloud_m
     view = observation.colored_view
     is_masked = observation.is_masked
-    hypothesize = partial(
-        _hypothesize, target=target, observation=observation, config=config, votes_rad=votes_rad
-    )
+    hypothesize = partial(_hypothesize, target=target, observation=observation, votes_rad=votes_rad)
 
     # First round: which pose is it, up to near-symmetric copies? Each pose stands for its copies,
     # one of which may have the surface colours that are observed.
     different_fits = _refine_different_poses(cloud_m, refined, others, target, config)
     different = [hypothesize(fit) for fit in different_fits]
+    if config.with_icp:
+        shares = share_among_poses(different, is_masked=is_masked)
+        different = _slide_likely(different, shares, target, observation)
     if view is not None:
         different = _merge_by_colored_copy(different, target, view)
     shares = share_among_poses(different, is_masked=is_masked)
@@ -116,6 +118,9 @@ def compete(
 
     # Second round: which of the copies is it? Each has its own colours.
     group = [hypothesize(fit) for fit in (winner.refined, *copies, *joining)]
+    if config.with_icp:
+        shares_by_depth = share_among_copies(group, is_masked=is_masked)
+        group = _slide_likely(group, shares_by_depth, target, observation)
     if view is not None:
         group = _with_own_color(group, target, view)
     copy_shares = group_share * share_among_copies(group, is_masked=is_masked)
@@ -133,23 +138,34 @@ def _hypothesize(
     refined: PoseFit,
     target: TargetObject,
     observation: Observation,
-    config: EstimateConfig,
     votes_rad: Callable[[Rigid], float] | None,
 ) -> Hypothesis:
-    """Compare a refined pose with the depth that was observed, and with a network's votes.
-
-    Where its points let it slide, it is compared where the image fits it best.
-    """
+    """Compare a refined pose with the depth that was observed, and with a network's votes."""
     pose = refined.camera_from_model.double()
-    evidence = compare(observation, pose, target.surface)
-    if config.with_icp:
-        refined, evidence = slide(refined, evidence, observation, target.surface)
-        pose = refined.camera_from_model.double()
     return Hypothesis(
         refined=refined,
-        evidence=evidence,
+        evidence=compare(observation, pose, target.surface),
         votes_rad=None if votes_rad is None else votes_rad(pose),
     )
+
+
+def _slide_likely(
+    hypotheses: Sequence[Hypothesis],
+    shares: Float64[Tensor, " n"],
+    target: TargetObject,
+    observation: Observation,
+) -> list[Hypothesis]:
+    """Slide each pose with a share of the probability to where the image fits it best."""
+    slid: list[Hypothesis] = []
+    for hypothesis, share in zip(hypotheses, shares.tolist(), strict=True):
+        if share < _LEAST_SLID:
+            slid.append(hypothesis)
+            continue
+        refined, evidence = slide(
+            hypothesis.refined, hypothesis.evidence, observation, target.surface
+        )
+        slid.append(replace(hypothesis, refined=refined, evidence=evidence))
+    return slid
 
 
 def _mark_copies(

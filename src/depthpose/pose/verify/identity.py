@@ -30,7 +30,6 @@ from depthpose.pose.sensor import EDGE_PX, INDEPENDENT_SIDES, LARGEST_OFFSET_M
 from depthpose.pose.types import Evidence, Identity
 from depthpose.pose.verify.evidence import Observation, compare
 from depthpose.pose.verify.hypotheses import Hypothesis
-from depthpose.pose.verify.probability import LEAST_AREA, log_likelihood_of_copy
 from depthpose.pose.verify.target_object import TargetObject
 
 POINTS = 400  #: points of the cloud that are compared, evenly taken
@@ -360,7 +359,7 @@ class _Fits(NamedTuple):
 
     name: str  #: of the model
     scale: Scale  #: that fits best
-    is_size_seen: bool  #: whether the image fits the model of this size better than its own
+    is_size_seen: bool  #: whether the image supports it as well as the own size
     mirror_gain: float | None  #: None where the mirror image is the model itself
     size_tolerance: float  #: share by which a right object may seem to differ in size
     mirror_tolerance: float  #: gain of the mirror image that deviating sides explain
@@ -419,18 +418,16 @@ def identify(
 def _is_size_seen(
     scale: Scale, best: Hypothesis, observation: Observation, surface: Surface
 ) -> bool:
-    """Whether the image fits the model of another size better than that of its own.
+    """Whether the image supports the model of another size as well as that of its own.
 
     Points beside an object lie near a larger model too, beyond which the camera then sees.
     """
-    evidence = compare(
+    resized = compare(
         observation.in_units_of(scale.times),
         Rigid(scale.pose.R, scale.pose.t_m / scale.times),
         surface,
     )
-    area = max(LEAST_AREA, evidence.visible, best.evidence.visible)
-    own = log_likelihood_of_copy(best.evidence, area)
-    return log_likelihood_of_copy(evidence, area) > own
+    return resized.agreement >= best.evidence.agreement
 
 
 def _explain_contradiction(fits: _Fits) -> str:

@@ -23,11 +23,11 @@ _POINTS = 1000  # of the cloud, by which directions are judged
 _LEAST_FIXED = 0.3
 """Root mean square component of the observed normals along a direction, from which the points fix
 the pose along it."""
-_REACH_DIAMETERS = 0.1
-"""Largest shift, to either side."""
-_COARSE_STEPS = 10
+_COARSE_DIAMETERS = 0.02
+_MOST_STEPS = 6
+"""Coarse steps by which a pose slides, and their largest number."""
 _FINE_STEPS = 5
-"""Steps to each side: of the reach, and of one coarse step."""
+"""Fine steps in a coarse one."""
 _FIXED_DIAMETERS = (0.0125, 0.025, 0.05)
 """Shifts by one of which an image that fixes a pose contradicts it."""
 _FIXED_PATCHES = 1.0
@@ -91,19 +91,30 @@ def _slide_along(
         """Compare the shifted pose with the image."""
         return compare(observation, Rigid(pose.R, pose.t_m + shift_m * direction), surface)
 
-    # Coarsely, then finely about the best place.
-    reach_m = _REACH_DIAMETERS * surface.diameter_m
-    step_m = reach_m / _COARSE_STEPS
-    coarse_m = torch.linspace(-reach_m, reach_m, 2 * _COARSE_STEPS + 1).tolist()
-    coarse = [log_likelihood_of_copy(compare_at(shift_m), area) for shift_m in coarse_m]
-    best = max(coarse)
-    if best <= log_likelihood_of_copy(evidence, area) + _BETTER:
-        return fit, evidence
-    around_m = torch.linspace(-step_m, step_m, 2 * _FINE_STEPS + 1)
-    fine_m = (coarse_m[coarse.index(best)] + around_m).tolist()
-    fine = [log_likelihood_of_copy(compare_at(shift_m), area) for shift_m in fine_m]
+    def measure_fit(shift_m: float) -> float:
+        """Measure how well the image fits the shifted pose: its log likelihood."""
+        return log_likelihood_of_copy(compare_at(shift_m), area)
 
-    # Edges are not compared, so that several places fit equally well.
+    # Uphill in coarse steps, to the side where the fit rises more.
+    step_m = _COARSE_DIAMETERS * surface.diameter_m
+    best_m = 0.0
+    best_fit = log_likelihood_of_copy(evidence, area)
+    backward, forward = measure_fit(-step_m), measure_fit(step_m)
+    signed_step_m = step_m if forward > backward else -step_m
+    next_fit = max(backward, forward)
+    steps = 1
+    while next_fit > best_fit + _BETTER and steps <= _MOST_STEPS:
+        best_m = steps * signed_step_m
+        best_fit = next_fit
+        steps += 1
+        next_fit = measure_fit(steps * signed_step_m)
+    if best_m == 0.0:
+        return fit, evidence
+
+    # Finely about the best place. Edges are not compared, so that several places fit equally well.
+    around_m = torch.linspace(-step_m, step_m, 2 * _FINE_STEPS + 1)
+    fine_m = (best_m + around_m).tolist()
+    fine = [measure_fit(shift_m) for shift_m in fine_m]
     least = max(fine) - _BETTER
     equal_m = [shift_m for shift_m, fitness in zip(fine_m, fine, strict=True) if fitness >= least]
     middle_m = (equal_m[0] + equal_m[-1]) / 2
