@@ -32,12 +32,17 @@ def angle() -> TargetObject:
 def pose_of(middle_m: float) -> Rigid:
     """The pose of the profile, tilted to show both sides, with its middle so far to the right."""
     R = rotation_by(torch.tensor([2.6, 0.0, 0.0], dtype=torch.float64))
-    return Rigid(R, torch.tensor([middle_m, 0.0, 0.35], dtype=torch.float64))
+    return Rigid(R, torch.tensor([middle_m, 0.0, 0.35]).double())
+
+
+def view_before_wall(model: ObjectModel, pose: Rigid) -> ViewInput:
+    depth_m, mask = view_of(model, pose.float())
+    depth_m = torch.where(mask, depth_m, torch.tensor(1.0).to(depth_m))
+    return ViewInput(name="x", depth_m=depth_m.float(), mask=mask, K=K.float(), object=model.name)
 
 
 def view_at(middle_m: float) -> ViewInput:
-    depth_m, mask = view_of(angle().model, pose_of(middle_m))
-    return ViewInput(name="x", depth_m=depth_m.float(), mask=mask, K=K.float(), object="angle")
+    return view_before_wall(angle().model, pose_of(middle_m))
 
 
 def observation_at(middle_m: float, *, is_masked: bool = True) -> Observation:
@@ -88,8 +93,7 @@ def test_an_end_in_the_image_fixes_a_shift_that_no_point_does() -> None:
     bar = boxes("bar", ((0.8, 0.05, 0.02), (0.0, 0.0, 0.0)))
     target = TargetObject(number=0, model=bar)
     pose = pose_of(0.0)
-    depth_m, mask = view_of(bar, pose)
-    view = ViewInput(name="x", depth_m=depth_m.float(), mask=mask, K=K.float(), object="bar")
+    view = view_before_wall(bar, pose)
     cloud_m = cloud_from_depth(view.depth_m, view.mask, K)
     without_end = observe(cloud_m, view, target.surface, is_masked=True)
     assert find_fixed_shift(pose, ALONG, without_end, target.surface) is None
@@ -103,7 +107,7 @@ def registered_poses(model: ObjectModel, view: ViewInput) -> list[Rigid]:
     return [estimate.camera_from_model, *others]
 
 
-@pytest.mark.parametrize("middle_m", [-0.12, -0.1, 0.11])
+@pytest.mark.parametrize("middle_m", [-0.12, -0.1])
 def test_a_long_part_that_leaves_the_image_is_named_where_it_is(middle_m: float) -> None:
     poses = registered_poses(angle().model, view_at(middle_m))
     errors_m = [

@@ -33,7 +33,7 @@ _STEPS = 6  # steps of ICP for poses that were refined roughly
 _SHARE_POINTS = 1000  # points of the cloud that measure what a pose leaves unexplained
 _UNEXPLAINED_MORE = 0.25
 """A competing pose that leaves by so much more of the readings unexplained is not compared."""
-_LEAST_SLID = 0.005  # share from which a pose slides
+_MOST_SLID = 2  # largest number of poses that slide in each round
 _MOST_LEADING = 8  # largest number of different poses that are compared
 _MOST_COPIES = 45  # and of near-symmetric copies of the best of them
 
@@ -98,8 +98,7 @@ def compete(
     different_fits = _refine_different_poses(cloud_m, refined, others, target, config)
     different = [hypothesize(fit) for fit in different_fits]
     if config.with_icp:
-        shares = share_among_poses(different, is_masked=is_masked)
-        different = _slide_likely(different, shares, target, observation)
+        different = _slide_likeliest(different, target, observation)
     if view is not None:
         different = _merge_by_colored_copy(different, target, view)
     shares = share_among_poses(different, is_masked=is_masked)
@@ -107,20 +106,20 @@ def compete(
 
     # The winner's copies. Another of the different poses may be one too: one between two copies
     # about an axis. Together they have the shares of all of these.
-    copies = _refine_distinct_copies(cloud_m, winner.refined, target, config, view)
-    is_copy = _mark_copies(different, [winner.refined, *copies], target)
+    copy_fits = _refine_distinct_copies(cloud_m, winner.refined, target, config, view)
+    is_copy = _mark_copies(different, [winner.refined, *copy_fits], target)
     joining = [
-        hypothesis.refined
+        hypothesis
         for hypothesis, joins in zip(different, is_copy, strict=True)
         if joins and hypothesis is not winner
     ]
     group_share = float(shares[torch.tensor(is_copy)].sum())
 
     # Second round: which of the copies is it? Each has its own colours.
-    group = [hypothesize(fit) for fit in (winner.refined, *copies, *joining)]
+    copies = [hypothesize(fit) for fit in copy_fits]
     if config.with_icp:
-        shares_by_depth = share_among_copies(group, is_masked=is_masked)
-        group = _slide_likely(group, shares_by_depth, target, observation)
+        copies = _slide_likeliest(copies, target, observation)
+    group = [winner, *copies, *joining]
     if view is not None:
         group = _with_own_color(group, target, view)
     copy_shares = group_share * share_among_copies(group, is_masked=is_masked)
@@ -149,22 +148,20 @@ def _hypothesize(
     )
 
 
-def _slide_likely(
-    hypotheses: Sequence[Hypothesis],
-    shares: Float64[Tensor, " n"],
-    target: TargetObject,
-    observation: Observation,
+def _slide_likeliest(
+    hypotheses: Sequence[Hypothesis], target: TargetObject, observation: Observation
 ) -> list[Hypothesis]:
-    """Slide each pose with a share of the probability to where the image fits it best."""
-    slid: list[Hypothesis] = []
-    for hypothesis, share in zip(hypotheses, shares.tolist(), strict=True):
-        if share < _LEAST_SLID:
-            slid.append(hypothesis)
-            continue
+    """Slide the likeliest hypotheses to where the image fits them best; the others stay."""
+    order = sorted(
+        range(len(hypotheses)), key=lambda k: -log_likelihood_ratio(hypotheses[k].evidence)
+    )
+    slid = list(hypotheses)
+    for k in order[:_MOST_SLID]:
+        hypothesis = hypotheses[k]
         refined, evidence = slide(
             hypothesis.refined, hypothesis.evidence, observation, target.surface
         )
-        slid.append(replace(hypothesis, refined=refined, evidence=evidence))
+        slid[k] = replace(hypothesis, refined=refined, evidence=evidence)
     return slid
 
 

@@ -17,23 +17,26 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.types import Evidence, PoseFit
 from depthpose.pose.verify.evidence import Observation, compare
-from depthpose.pose.verify.probability import LEAST_AGREEMENT, LEAST_AREA, log_likelihood_of_copy
+from depthpose.pose.verify.probability import LEAST_AGREEMENT
 
 _POINTS = 1000  # of the cloud, by which directions are judged
-_LEAST_FIXED = 0.3
+_LEAST_FIXED = 0.4
 """Root mean square component of the observed normals along a direction, from which the points fix
 the pose along it."""
-_COARSE_DIAMETERS = 0.02
-_MOST_STEPS = 6
-"""Coarse steps by which a pose slides, and their largest number."""
-_FINE_STEPS = 5
+_COARSE_DIAMETERS = 0.025
+_REACH = 4
+_MOST_STEPS = 40
+"""A coarse step; how many are tried to either side, and how far a pose slides where it goes on."""
+_FINE_STEPS = 4
 """Fine steps in a coarse one."""
+_CLEARER_PATCHES = 1.0
+"""Independent patches by which a step must be better."""
+_EQUAL_PATCHES = 0.5
+"""Places that differ by less fit equally well."""
 _FIXED_DIAMETERS = (0.0125, 0.025, 0.05)
 """Shifts by one of which an image that fixes a pose contradicts it."""
 _FIXED_PATCHES = 1.0
 """Independent patches by which it contradicts the shifted pose more."""
-_BETTER = 0.02
-"""Log likelihood by which a place must be better; places that differ by less fit equally well."""
 
 
 def slide(
@@ -85,46 +88,45 @@ def _slide_along(
 ) -> tuple[PoseFit, Evidence]:
     """Slide a pose along a direction; arguments and result are those of :func:`slide`."""
     pose = fit.camera_from_model.double()
-    area = max(LEAST_AREA, evidence.visible)
+    thinned = observation.thinned()
 
-    def compare_at(shift_m: float) -> Evidence:
-        """Compare the shifted pose with the image."""
-        return compare(observation, Rigid(pose.R, pose.t_m + shift_m * direction), surface)
+    def shift(shift_m: float) -> Rigid:
+        """Shift the pose along the direction."""
+        return Rigid(pose.R, pose.t_m + shift_m * direction)
 
-    def measure_fit(shift_m: float) -> float:
-        """Measure how well the image fits the shifted pose: its log likelihood."""
-        return log_likelihood_of_copy(compare_at(shift_m), area)
+    def measure_misfit(shift_m: float) -> float:
+        """Measure how much of the shifted surface the image does not support, in patches."""
+        shifted = compare(thinned, shift(shift_m), surface)
+        return shifted.contradicted + shifted.continued + shifted.unobserved
 
-    # Uphill in coarse steps, to the side where the fit rises more.
+    # In coarse steps, if one to either side is better, and on where the last one is the best.
     step_m = _COARSE_DIAMETERS * surface.diameter_m
-    best_m = 0.0
-    best_fit = log_likelihood_of_copy(evidence, area)
-    backward, forward = measure_fit(-step_m), measure_fit(step_m)
-    signed_step_m = step_m if forward > backward else -step_m
-    next_fit = max(backward, forward)
-    steps = 1
-    while next_fit > best_fit + _BETTER and steps <= _MOST_STEPS:
-        best_m = steps * signed_step_m
-        best_fit = next_fit
-        steps += 1
-        next_fit = measure_fit(steps * signed_step_m)
-    if best_m == 0.0:
+    misfits = {step: measure_misfit(step * step_m) for step in (-1, 0, 1)}
+    if min(misfits.values()) > misfits[0] - _CLEARER_PATCHES:
         return fit, evidence
+    for step in range(2, _REACH + 1):
+        misfits[step] = measure_misfit(step * step_m)
+        misfits[-step] = measure_misfit(-step * step_m)
+    best = min(misfits, key=misfits.__getitem__)
+    outward = 1 if best > 0 else -1
+    while abs(best) >= _REACH and best + outward not in misfits and abs(best) < _MOST_STEPS:
+        misfits[best + outward] = measure_misfit((best + outward) * step_m)
+        best = min(misfits, key=misfits.__getitem__)
 
-    # Finely about the best place. Edges are not compared, so that several places fit equally well.
-    around_m = torch.linspace(-step_m, step_m, 2 * _FINE_STEPS + 1)
-    fine_m = (best_m + around_m).tolist()
-    fine = [measure_fit(shift_m) for shift_m in fine_m]
-    least = max(fine) - _BETTER
-    equal_m = [shift_m for shift_m, fitness in zip(fine_m, fine, strict=True) if fitness >= least]
+    # In fine steps about the best place. Edges are not compared: several places fit equally well.
+    around = torch.linspace(-1, 1, 2 * _FINE_STEPS + 1).tolist()
+    fine_m = [(best + step) * step_m for step in around]
+    fine = [measure_misfit(shift_m) for shift_m in fine_m]
+    most = min(fine) + _EQUAL_PATCHES
+    equal_m = [shift_m for shift_m, misfit in zip(fine_m, fine, strict=True) if misfit <= most]
     middle_m = (equal_m[0] + equal_m[-1]) / 2
     deviation_m = (equal_m[-1] - equal_m[0]) / 2 + step_m / _FINE_STEPS
     slid = replace(
         fit,
-        camera_from_model=Rigid(pose.R, pose.t_m + middle_m * direction),
+        camera_from_model=shift(middle_m),
         covariance=_set_deviation(fit.covariance, direction, deviation_m),
     )
-    return slid, compare_at(middle_m)
+    return slid, compare(observation, slid.camera_from_model, surface)
 
 
 def _set_deviation(
