@@ -90,20 +90,6 @@ class Observation:
         """Focal length of the image itself, before it was thinned."""
         return self.step * float(self.K[0, 0])
 
-    def thinned(self) -> "Observation":
-        """Take every other row and column: a third of the time to compare a pose with it."""
-        K = self.K.clone()
-        K[:2] /= 2
-        return replace(
-            self,
-            depth_m=np.ascontiguousarray(self.depth_m[::2, ::2]),
-            is_object=np.ascontiguousarray(self.is_object[::2, ::2]),
-            is_background=np.ascontiguousarray(self.is_background[::2, ::2]),
-            K=K,
-            step=2 * self.step,
-            patch_px=max(1.0, self.patch_px / 2),
-        )
-
     def in_units_of(self, length_m: float) -> "Observation":
         """Measure all depths and deviations in another unit of length, as if it were a metre.
 

@@ -33,7 +33,10 @@ _STEPS = 6  # steps of ICP for poses that were refined roughly
 _SHARE_POINTS = 1000  # points of the cloud that measure what a pose leaves unexplained
 _UNEXPLAINED_MORE = 0.25
 """A competing pose that leaves by so much more of the readings unexplained is not compared."""
-_MOST_SLID = 2  # largest number of poses that slide in each round
+_MOST_SLID = 12
+_LEAST_SLID = 0.02
+"""Largest number of poses that slide in each round, and the share of the probability from which
+they do."""
 _MOST_LEADING = 8  # largest number of different poses that are compared
 _MOST_COPIES = 45  # and of near-symmetric copies of the best of them
 
@@ -98,7 +101,8 @@ def compete(
     different_fits = _refine_different_poses(cloud_m, refined, others, target, config)
     different = [hypothesize(fit) for fit in different_fits]
     if config.with_icp:
-        different = _slide_likeliest(different, target, observation)
+        shares = share_among_poses(different, is_masked=is_masked)
+        different = _slide_likely(different, shares, target, observation)
     if view is not None:
         different = _merge_by_colored_copy(different, target, view)
     shares = share_among_poses(different, is_masked=is_masked)
@@ -118,7 +122,8 @@ def compete(
     # Second round: which of the copies is it? Each has its own colours.
     copies = [hypothesize(fit) for fit in copy_fits]
     if config.with_icp:
-        copies = _slide_likeliest(copies, target, observation)
+        shares_with_winner = share_among_copies([winner, *copies], is_masked=is_masked)
+        copies = _slide_likely(copies, shares_with_winner[1:], target, observation)
     group = [winner, *copies, *joining]
     if view is not None:
         group = _with_own_color(group, target, view)
@@ -148,20 +153,22 @@ def _hypothesize(
     )
 
 
-def _slide_likeliest(
-    hypotheses: Sequence[Hypothesis], target: TargetObject, observation: Observation
+def _slide_likely(
+    hypotheses: Sequence[Hypothesis],
+    shares: Float64[Tensor, " n"],
+    target: TargetObject,
+    observation: Observation,
 ) -> list[Hypothesis]:
-    """Slide the likeliest hypotheses to where the image fits them best; the others stay."""
-    order = sorted(
-        range(len(hypotheses)), key=lambda k: -log_likelihood_ratio(hypotheses[k].evidence)
-    )
+    """Slide the likely hypotheses to where the image fits them best; the others stay.
+
+    ``shares``: of the probability, of each.
+    """
     slid = list(hypotheses)
-    for k in order[:_MOST_SLID]:
-        hypothesis = hypotheses[k]
-        refined, evidence = slide(
-            hypothesis.refined, hypothesis.evidence, observation, target.surface
-        )
-        slid[k] = replace(hypothesis, refined=refined, evidence=evidence)
+    for k in shares.argsort(descending=True)[:_MOST_SLID].tolist():
+        if float(shares[k]) >= _LEAST_SLID:
+            fit, evidence = slid[k].refined, slid[k].evidence
+            refined, evidence = slide(fit, evidence, observation, target.surface)
+            slid[k] = replace(slid[k], refined=refined, evidence=evidence)
     return slid
 
 

@@ -23,12 +23,8 @@ _POINTS = 1000  # of the cloud, by which directions are judged
 _LEAST_FIXED = 0.4
 """Root mean square component of the observed normals along a direction, from which the points fix
 the pose along it."""
-_COARSE_DIAMETERS = 0.025
-_REACH = 4
-_MOST_STEPS = 40
-"""A coarse step; how many are tried to either side, and how far a pose slides where it goes on."""
-_FINE_STEPS = 4
-"""Fine steps in a coarse one."""
+_COARSE_DIAMETERS = 0.025  # a coarse step
+_FINE_STEPS = 4  # fine steps in a coarse one
 _CLEARER_PATCHES = 1.0
 """Independent patches by which a step must be better."""
 _EQUAL_PATCHES = 0.5
@@ -88,7 +84,6 @@ def _slide_along(
 ) -> tuple[PoseFit, Evidence]:
     """Slide a pose along a direction; arguments and result are those of :func:`slide`."""
     pose = fit.camera_from_model.double()
-    thinned = observation.thinned()
 
     def shift(shift_m: float) -> Rigid:
         """Shift the pose along the direction."""
@@ -96,26 +91,28 @@ def _slide_along(
 
     def measure_misfit(shift_m: float) -> float:
         """Measure how much of the shifted surface the image does not support, in patches."""
-        shifted = compare(thinned, shift(shift_m), surface)
+        shifted = compare(observation, shift(shift_m), surface)
         return shifted.contradicted + shifted.continued + shifted.unobserved
 
-    # In coarse steps, if one to either side is better, and on where the last one is the best.
+    # In coarse steps, to the side that is better, as long as it grows better.
     step_m = _COARSE_DIAMETERS * surface.diameter_m
-    misfits = {step: measure_misfit(step * step_m) for step in (-1, 0, 1)}
-    if min(misfits.values()) > misfits[0] - _CLEARER_PATCHES:
+    start_misfit = evidence.contradicted + evidence.continued + evidence.unobserved
+    backward = measure_misfit(-step_m)
+    forward = measure_misfit(step_m)
+    best_misfit = min(backward, forward)
+    if best_misfit > start_misfit - _CLEARER_PATCHES:
         return fit, evidence
-    for step in range(2, _REACH + 1):
-        misfits[step] = measure_misfit(step * step_m)
-        misfits[-step] = measure_misfit(-step * step_m)
-    best = min(misfits, key=misfits.__getitem__)
-    outward = 1 if best > 0 else -1
-    while abs(best) >= _REACH and best + outward not in misfits and abs(best) < _MOST_STEPS:
-        misfits[best + outward] = measure_misfit((best + outward) * step_m)
-        best = min(misfits, key=misfits.__getitem__)
+    signed_step_m = step_m if forward < backward else -step_m
+    best_m = signed_step_m
+    next_misfit = measure_misfit(best_m + signed_step_m)
+    while next_misfit < best_misfit and abs(best_m) < surface.diameter_m:
+        best_m += signed_step_m
+        best_misfit = next_misfit
+        next_misfit = measure_misfit(best_m + signed_step_m)
 
     # In fine steps about the best place. Edges are not compared: several places fit equally well.
     around = torch.linspace(-1, 1, 2 * _FINE_STEPS + 1).tolist()
-    fine_m = [(best + step) * step_m for step in around]
+    fine_m = [best_m + step * step_m for step in around]
     fine = [measure_misfit(shift_m) for shift_m in fine_m]
     most = min(fine) + _EQUAL_PATCHES
     equal_m = [shift_m for shift_m, misfit in zip(fine_m, fine, strict=True) if misfit <= most]
