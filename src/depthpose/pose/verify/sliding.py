@@ -51,7 +51,10 @@ def slide(
         deviation, and the evidence of it; both as they were where no place is better, or where so
         much contradicts the pose that it is wrong in another way.
     """
-    if evidence.contradicted == 0 or evidence.agreement < LEAST_AGREEMENT:
+    # Without a mask nothing contradicts a pose that leaves readings of its object uncovered.
+    if not observation.is_masked or evidence.contradicted == 0:
+        return fit, evidence
+    if evidence.agreement < LEAST_AGREEMENT:
         return fit, evidence
     for direction in _find_free_directions(fit.camera_from_model.double(), observation, surface):
         fit, evidence = _slide_along(direction, fit, evidence, observation, surface)
