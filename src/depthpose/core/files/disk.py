@@ -476,14 +476,15 @@ def write_json(path: AnyPath, value: object) -> None:
 def read_key_values(path: AnyPath) -> dict[str, list[float]]:
     """Read ``KEY: numbers`` lines, as of KITTI's calibrations: the numbers by key.
 
-    ``key=[a b; c d]``, as of Middlebury's, is read row by row. Keys of other values, such as dates,
+    ``key=[a b; c d]``, as of Middlebury's, is read row by row. Keys of words alone, such as dates,
     are left out, and so are blank lines and what follows ``#``.
 
     Raises:
-        InputError: the file is missing or not text, a line has no key or repeats one, or a number
-            is not finite.
+        InputError: the file is missing or not text, a line has no key, repeats one or mixes numbers
+            and words, or a number is not finite.
     """
-    values: dict[str, list[float]] = {}
+    keys: set[str] = set()  # of all lines, those of words too
+    numbers_of_key: dict[str, list[float]] = {}
     for number, line in enumerate(read_text(path, MAX_LIST_BYTES).splitlines(), start=1):
         text = line.partition("#")[0].strip()
         if not text:
@@ -491,16 +492,29 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
         match = _KEY_VALUE.fullmatch(text)
         if match is None:
             raise InputError(f"{path}: line {number}, {text[:60]!r}, is not 'KEY: numbers'")
-        if match[1] in values:
-            raise InputError(f"{path}: line {number} gives {match[1]!r} again; keep one of them")
+        key, content = match.groups()
+        if key in keys:
+            raise InputError(f"{path}: line {number} gives {key!r} again; keep one of them")
+        keys.add(key)
+
+        # Numbers alone, or words alone.
         numbers: list[float] = []
-        with suppress(ValueError):  # a date, or other words
-            numbers = [float(word) for word in match[2].translate(_BRACKETS_TO_BLANKS).split()]
+        others: list[str] = []
+        for word in content.translate(_BRACKETS_TO_BLANKS).split():
+            try:
+                numbers.append(float(word))
+            except ValueError:
+                others.append(word)
+        if numbers and others:
+            raise InputError(
+                f"{path}: line {number}, {key!r}, mixes numbers and words ({others[0][:60]!r}); "
+                "correct the number, or put a # before the line"
+            )
         if not all(map(math.isfinite, numbers)):
-            raise InputError(f"{path}: line {number}, {match[1]!r}, holds NaN or infinity")
+            raise InputError(f"{path}: line {number}, {key!r}, holds NaN or infinity")
         if numbers:
-            values[match[1]] = numbers
-    return values
+            numbers_of_key[key] = numbers
+    return numbers_of_key
 
 
 def parse_finite(text: str) -> float:
