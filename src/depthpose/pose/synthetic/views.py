@@ -1,9 +1,10 @@
 """Synthetic views of known objects, by index.
 
-A view is rendered at a pose, or turned out of a view that was rendered before. A camera that turns
-about its own centre sees the same surface points, along other rays. A stored view is therefore a
-view from every direction of gaze, and only its pixels are interpolated: inverse depth, which is
-linear in the picture of a plane, so that flat parts stay exact. Depth is NaN where nothing is seen.
+A view is rendered at a pose, or resampled from a stored view by rotating the camera about its
+centre. The rotated camera sees the same surface points along other rays, so that a stored view
+serves every direction of the optical axis, and only its pixels are interpolated: inverse depth,
+which is linear in the picture of a plane, so that flat parts stay exact. Depth is NaN where nothing
+is seen.
 """
 
 import math
@@ -133,7 +134,7 @@ def render_view(shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]) -> CleanView
 def turn_view(
     view: CleanView, turn: Float[Tensor, "3 3"], shape: Shape, K: Float[Tensor, "3 3"]
 ) -> CleanView:
-    """Resample a view as a rotated camera sees it: ``x_new = turn @ x_old``.
+    """Resample a view as a camera rotated about its centre sees it: ``x_new = turn @ x_old``.
 
     Args:
         view: the view.
