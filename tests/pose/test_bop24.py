@@ -193,8 +193,15 @@ def test_targets_of_detection_are_whole_images(synthetic: BopDataset, tmp_path: 
 def test_a_symmetric_copy_is_not_far(synthetic: BopDataset, error: str) -> None:
     """A body of revolution of which only one side has vertices, rotated by half a turn."""
     bottle = synthetic.objects[10]
-    one_side = bottle.vertices_m[bottle.vertices_m[:, 0] > 0.6 * bottle.vertices_m[:, 0].max()]
-    model = replace(bottle, vertices_m=one_side, faces=bottle.faces[:0], diameter_m=0.02)
+    x_m = bottle.vertices_m[:, 0]
+    on_one_side = x_m > 0.6 * x_m.max()
+    model = replace(
+        bottle,
+        vertices_m=bottle.vertices_m[on_one_side],
+        normals=bottle.normals[on_one_side],
+        faces=bottle.faces[:0],
+        diameter_m=0.02,
+    )
     context = ErrorContext(
         model=model,
         diameter_m=model.diameter_m,
