@@ -1,10 +1,18 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, Literal
 
 import pytest
 
-from depthpose.core.config import config_from_dict, config_to_dict, read_config, write_config
+from depthpose.core.config import (
+    ASCENDING,
+    Settings,
+    config_from_dict,
+    config_to_dict,
+    read_config,
+    write_config,
+)
 from depthpose.core.errors import InputError
 
 
@@ -117,3 +125,23 @@ def test_a_missing_config_is_named(tmp_path: Path) -> None:
 def test_the_source_is_named() -> None:
     with pytest.raises(InputError, match=r"^the weights' config: unknown key"):
         config_from_dict({"z": 1}, Inner, source="the weights' config")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules(Settings):
+    span_px: Annotated[int | None, "[16, inf)", 16] = None
+    range_m: Annotated[tuple[float, float] | None, "(0, inf)", ASCENDING] = None
+    kind: Literal["near", "far"] | None = None
+
+
+def test_settings_that_are_none_keep_to_every_rule() -> None:
+    assert Rules().span_px is None
+
+
+def test_the_error_of_a_rule_names_a_remedy() -> None:
+    with pytest.raises(InputError, match="span_px must be a multiple of 16, got 40; take 48"):
+        Rules(span_px=40)
+    with pytest.raises(InputError, match=r"the lower end first, got \(2\.0, 1\.0\); swap the two"):
+        Rules(range_m=(2.0, 1.0))
+    with pytest.raises(InputError, match="kind"):
+        Rules(kind="nera")  # pyright: ignore[reportArgumentType]

@@ -104,3 +104,18 @@ def test_names_pair_however_their_accents_are_stored() -> None:
     assert composed != apart
     assert find_partners([composed, "b"], ["b", apart], "x") == [1, 0]
     assert normalise_stem(Path(f"{composed}.png")) == normalise_stem(Path(f"{apart}.jpg"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("P2: 7.2e2 0 6O9.5 1\nP2: 1 2 3\n", r"line 1, 'P2', mixes numbers and words \('6O9.5'\)"),
+        ("calib_time: 09-Jan-2012 13:57:47\ncalib_time: 1\n", "line 2 gives 'calib_time' again"),
+    ],
+)
+def test_a_line_that_is_neither_numbers_nor_words_is_refused(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    (tmp_path / "calib.txt").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_key_values(tmp_path / "calib.txt")

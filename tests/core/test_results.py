@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from depthpose.core.run_folder import RESULTS, is_whole, note_result, read_results
+from depthpose.core.run_folder import RESULTS, is_result_finished, note_result, read_results
 
 
 def make(folder: Path, name: str = "a") -> list[Path]:
@@ -41,10 +41,10 @@ def test_whatever_is_damaged_is_noticed(
 ) -> None:
     files = make(tmp_path)
     make(tmp_path, "other")
-    assert is_whole(tmp_path, "a", ["a.npy"])
+    assert is_result_finished(tmp_path, "a", ["a.npy"])
     damage(files[which])
-    assert not is_whole(tmp_path, "a", ["a.npy"])
-    assert is_whole(tmp_path, "other", ["other.npy"])
+    assert not is_result_finished(tmp_path, "a", ["a.npy"])
+    assert is_result_finished(tmp_path, "other", ["other.npy"])
 
 
 @pytest.mark.parametrize("damage", [Path.unlink, lambda file: os.truncate(file, 9)])
@@ -53,21 +53,21 @@ def test_a_result_of_which_the_note_is_lost_is_made_again(
 ) -> None:
     make(tmp_path)
     damage(tmp_path / RESULTS)
-    assert not is_whole(tmp_path, "a", ["a.npy"]), "no file is known to be whole"
+    assert not is_result_finished(tmp_path, "a", ["a.npy"]), "no file is known to be whole"
     make(tmp_path)
-    assert is_whole(tmp_path, "a", ["a.npy"])
+    assert is_result_finished(tmp_path, "a", ["a.npy"])
 
 
 def test_what_was_not_noted_is_not_finished_with_it(tmp_path: Path) -> None:
     make(tmp_path)
     (tmp_path / "a.ply").write_bytes(b"of another run")
-    assert not is_whole(tmp_path, "a", ["a.npy", "a.ply"])
+    assert not is_result_finished(tmp_path, "a", ["a.npy", "a.ply"])
 
 
 def test_a_file_with_another_time_is_made_again(tmp_path: Path) -> None:
     files = make(tmp_path)
     os.utime(files[0], ns=(5, 5))
-    assert not is_whole(tmp_path, "a", ["a.npy"])
+    assert not is_result_finished(tmp_path, "a", ["a.npy"])
 
 
 def test_what_a_killed_process_left_of_its_line_harms_no_other(tmp_path: Path) -> None:
@@ -85,4 +85,4 @@ def test_what_a_killed_process_left_of_its_line_harms_no_other(tmp_path: Path) -
 def test_a_result_can_be_marked_as_to_be_made_again(tmp_path: Path) -> None:
     make(tmp_path)
     note_result(tmp_path, "a", [])
-    assert not is_whole(tmp_path, "a", ["a.npy"])
+    assert not is_result_finished(tmp_path, "a", ["a.npy"])

@@ -13,7 +13,7 @@ from depthpose.core.processes import ProcessRank, find_rank, wait_for
 from depthpose.core.run_folder import (
     claim_folder,
     claim_names,
-    is_whole,
+    is_result_finished,
     note_result,
     read_settings,
     read_sources,
@@ -83,8 +83,9 @@ def test_a_folder_of_others_has_no_settings(tmp_path: Path) -> None:
     assert read_settings(tmp_path) is None
 
 
-def test_a_foreign_record_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "run.json").write_text("[1]")
+@pytest.mark.parametrize("content", ["[1]", "null"])
+def test_a_foreign_record_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "run.json").write_text(content)
     with pytest.raises(InputError, match="not a record of a run"):
         claim_folder(tmp_path, {"a": 1})
     with pytest.raises(InputError, match="has no 'settings'"):
@@ -229,11 +230,11 @@ def test_results_of_which_the_source_is_lost_are_made_again(
     (out / "a.npy").write_bytes(b"2")
     note_result(out, "a", [out / "a.npy"])
     claim_names(out, {"a": source}, [".npy"])
-    assert is_whole(out, "a", ["a.npy"])
+    assert is_result_finished(out, "a", ["a.npy"])
     record = out / "sources.json"
     record.unlink() if content is None else record.write_text(content)
     claim_names(out, {"a": source}, [".npy"])
-    assert not is_whole(out, "a", ["a.npy"])
+    assert not is_result_finished(out, "a", ["a.npy"])
     assert read_sources(out)["a"][0] == str(source)
 
 

@@ -2,16 +2,19 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from depthpose.cli import main
+from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.errors import InputError
+from depthpose.core.render import rasterize
 from depthpose.depth.config import NearConfig
 from depthpose.depth.datasets import open_dataset, write_scene
 from depthpose.depth.disparity import disparity_from_depth, warp_right_to_left
 from depthpose.depth.synthetic import SyntheticFrame, make_near, render_near
-from depthpose.depth.synthetic.near import NearScene
+from depthpose.depth.synthetic.near import NearScene, _NearSceneBuilder
 
 SMALL = NearConfig(
     columns_px=(144.0, 192.0), infrared_share=0.0, border_share=0.0, jpeg_share=0.0,
@@ -125,3 +128,17 @@ def test_unusable_numbers_are_refused(tmp_path: Path, capsys: pytest.CaptureFixt
         render_near(SMALL, -1)
     assert main(["data", "make", "near", "--out", str(tmp_path / "n"), "--number", "0"]) == 2
     assert "--number 0" in capsys.readouterr().err
+
+
+def test_an_open_room_fills_the_view() -> None:
+    open_rooms = 0
+    for seed in range(8):
+        builder = _NearSceneBuilder(np.random.default_rng(seed), 1.0, (0.5, 0.35), 0.3)
+        builder.add_room(8.0)
+        is_open = builder.last_backdrop_id == 2  # a floor and a back wall alone
+        open_rooms += is_open
+        if is_open:
+            corners = torch.from_numpy(builder.builder.finish().corners)
+            raster = rasterize(corners, intrinsics(100, 100, 49.5, 34.5), 100, 70)
+            assert bool(raster.depth_m.isfinite().all())
+    assert open_rooms > 0

@@ -257,3 +257,13 @@ def test_every_weight_of_pointnet_learns_and_transforms_begin_as_nothing() -> No
 def test_a_training_step_takes_a_cloud_of_one_point() -> None:
     network = PointNet(POINTNET).train()
     assert network(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long)).isfinite().all()
+
+
+def test_a_view_of_double_precision_is_cropped() -> None:
+    view = view_of(Rigid(turned(0), torch.tensor([0.1, -0.05, 0.8])))
+    single = cut_depth(view, SMALL)
+    double = cut_depth(replace(view, depth_m=view.depth_m.double()), SMALL)
+    assert single is not None
+    assert double is not None
+    torch.testing.assert_close(double.R.float(), single.R)
+    torch.testing.assert_close(double.middle_m.float(), single.middle_m)

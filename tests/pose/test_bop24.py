@@ -10,12 +10,17 @@ import torch
 from tests.pose.synthetic_frames import make_dataset, moved, predictions_of
 
 from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, Instance, check_bop, open_bop, read_targets
 from depthpose.pose.evaluate import evaluate, select_targets
+from depthpose.pose.evaluate.detection import _is_certainly_far
+from depthpose.pose.evaluate.errors import METRICS, ErrorContext
+from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.metrics import average_precision
 from depthpose.pose.predictions import Prediction, name_bop_results, place_of
 
+METRIC_LIMITS = {"mssd_m": 0.5 * 0.02, "mspd_px": 50 * 160 / 640}
 WITHOUT_VSD = EvaluationConfig(with_vsd=False)
 
 
@@ -182,3 +187,34 @@ def test_targets_of_detection_are_whole_images(synthetic: BopDataset, tmp_path: 
     ]
     with pytest.raises(InputError, match="nothing that the 1 targets ask for is annotated"):
         select_targets(synthetic, [replace(targets[0], scene_id=8)])
+
+
+@pytest.mark.parametrize("error", ["mssd_m", "mspd_px"])
+def test_a_symmetric_copy_is_not_far(synthetic: BopDataset, error: str) -> None:
+    """A body of revolution of which only one side has vertices, rotated by half a turn."""
+    bottle = synthetic.objects[10]
+    x_m = bottle.vertices_m[:, 0]
+    on_one_side = x_m > 0.6 * x_m.max()
+    model = replace(
+        bottle,
+        vertices_m=bottle.vertices_m[on_one_side],
+        normals=bottle.normals[on_one_side],
+        faces=bottle.faces[:0],
+        diameter_m=0.02,
+    )
+    context = ErrorContext(
+        model=model,
+        diameter_m=model.diameter_m,
+        is_adds=True,
+        vsd_delta_m=None,
+        symmetries=symmetry_transforms(model.symmetries),
+        triangles_m=torch.zeros(0, 3, 3),
+    )
+    instance = next(i for i in synthetic.instances if i.object_id == 10)
+    magnified = replace(instance, K=instance.K * torch.tensor([[8.0], [8], [1]]))
+    half_turn = Rigid(torch.diag(torch.tensor([-1.0, -1, 1])).double(), torch.zeros(3).double())
+    pose = instance.camera_from_model.double() @ half_turn
+    assert float(METRICS[error].measure(pose, magnified, context)) < METRIC_LIMITS[error]
+    assert not _is_certainly_far(error, pose, magnified, context)
+    away = Rigid(pose.R, pose.t_m + torch.tensor([0.5, 0.0, 0.0]))
+    assert _is_certainly_far(error, away, magnified, context)

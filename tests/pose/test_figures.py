@@ -9,9 +9,9 @@ from tests.pose.synthetic_objects import bracket
 from depthpose.core.errors import InputError
 from depthpose.thesis.pose_figures import (
     arrange_grid,
+    draw_colored_cloud,
     draw_directions,
     draw_discs,
-    draw_features,
     spectral,
 )
 from depthpose.thesis.tsne import embed_line, joint_probabilities, kl_gradient
@@ -75,7 +75,7 @@ def test_near_points_cover_far_ones() -> None:
 def test_a_cloud_is_drawn_over_its_model_from_where_it_was_seen() -> None:
     model = bracket()
     cloud = model.vertices_m[model.vertices_m[:, 1] > 0.02]
-    image = draw_features(cloud, torch.zeros(len(cloud)), model, 200)
+    image = draw_colored_cloud(cloud, torch.zeros(len(cloud)), model, 200)
     is_black = (image.sum(0) == 0).sum()
     is_red = ((image[0] > 0.5) & (image[1] < 0.1)).sum()
     assert int(is_black) > 2000

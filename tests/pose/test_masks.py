@@ -146,3 +146,19 @@ def test_a_mask_is_of_one_image() -> None:
     for wrong in (ONE[None], ONE[0]):
         with pytest.raises(InputError, match=r"m: the mask is of shape .*, not \(h, w\); give"):
             labels_input(wrong, "m")
+
+
+def test_sixteen_bits_with_a_transparent_value_keep_their_numbers(tmp_path: Path) -> None:
+    values = np.zeros((20, 30), np.uint16)
+    values[2:8, 2:8] = 300
+    values[10:18, 10:18] = 1000
+    path = tmp_path / "mask.png"
+    Image.fromarray(values).save(path, transparency=65535)
+    with Image.open(path) as image:
+        assert image.info["transparency"] == 65535
+    assert torch.equal(read_labels(path), torch.from_numpy(values.astype(np.int64)))
+    # Where the transparent value occurs, it is background.
+    Image.fromarray(np.where(values == 0, 500, values).astype(np.uint16)).save(
+        path, transparency=500
+    )
+    assert torch.equal(read_labels(path), torch.from_numpy(values.astype(np.int64)))

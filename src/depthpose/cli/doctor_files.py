@@ -135,16 +135,21 @@ def _describe_mesh(path: Path) -> FileFacts:
     points = torch.from_numpy(vertices)
     if not len(faces):
         return _describe_points(path, points)
-    diameter = measure_diameter(points)
+
+    # The unit: no object is so large in metres, or so small in millimetres.
+    diameter = measure_diameter(points)  # in the unit of the file
     if diameter > _MAX_LENGTH_M:
         unit = "millimetres (--unit mm)"
     elif diameter < _MIN_LENGTH_MM:
         unit = "metres (--unit m)"
     else:
         unit = "metres, cm or mm; measure it"
-    # STL repeats the points of every face, and other files those at edges.
-    count = len(np.unique(vertices, axis=0))
-    description = f"mesh of {count} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
+
+    # STL repeats the points of every face, and other files those at edges: each counts once.
+    point_count = len(np.unique(vertices, axis=0))
+    description = (
+        f"mesh of {point_count} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
+    )
     return FileFacts(path=path, description=description, model=points)
 
 

@@ -385,7 +385,7 @@ def _with_models(
 def _with_dataset(config: "_PoseConfig", folder: str) -> "_PoseConfig":
     """Return the config of a training of poses with the models and frames of another dataset.
 
-    Only the parts that the config takes from a dataset are changed.
+    What the config does not take from a dataset, such as models of CAD files, stays.
 
     Raises:
         InputError: the config takes nothing from a dataset.
@@ -397,12 +397,13 @@ def _with_dataset(config: "_PoseConfig", folder: str) -> "_PoseConfig":
         images = replace(config.images, folder=folder)
         return replace(config, images=images, held_out=held_out)
 
-    # Models may be CAD files, and all views synthetic.
+    # ``bop`` is None where models are CAD files, ``frames`` where all views are synthetic.
     models = config.models
     frames = config.frames
     if models.bop is None and frames is None:
-        message = "the config learns from no dataset; see --cad and --what"
-        raise InputError(f"--data {folder}: {message}")
+        raise InputError(
+            f"--data {folder}: the config learns from no dataset; see --cad and --what"
+        )
     if models.bop is not None:
         models = replace(models, bop=folder)
     if frames is not None:

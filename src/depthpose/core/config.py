@@ -29,7 +29,7 @@ ASCENDING = "ascending"
 class _Rule:
     """The rule that a setting must keep to, as its type says."""
 
-    words: tuple[str, ...]  # the allowed words; none: any value
+    choices: tuple[str, ...]  # the allowed words; none: any value
     interval: str  # such as "[16, inf)", for each number in the setting; "": any number
     multiples_of: tuple[Any, ...]  # the setting must be a multiple of each
     is_ascending: bool  # whether the first of two numbers may not exceed the second
@@ -40,39 +40,59 @@ class Settings:
 
     ``Annotated[int, "[16, inf)", 16]`` is an interval, and a number that the setting must be a
     multiple of. ``ASCENDING`` behind the interval says that the first of two numbers must not
-    exceed the second. Of ``Literal`` the words are allowed.
+    exceed the second. Of ``Literal`` the words are allowed. None keeps to every rule.
 
     Raises:
         InputError: a value breaks these rules.
     """
 
     def __post_init__(self) -> None:
+        """Check every setting against the rule of its type."""
         for name, rule in _read_rules(type(self)).items():
             value = getattr(self, name)
+            if value is None:
+                continue
             default = getattr(type(self), name, None)
+            _check_entries(name, value, rule, default)
+            _check_order(name, value, rule)
+            _check_multiple(name, value, rule, default)
 
-            # The words and the interval apply to each entry of a tuple.
-            entries = value if isinstance(value, tuple) else (value,)
-            for entry in entries:
-                if entry is None:
-                    continue
-                if rule.words and entry not in rule.words:
-                    refuse_unknown(name, entry, rule.words)
-                if rule.interval and not _is_in_interval(entry, rule.interval):
-                    remedy = "" if default is None else f"; the default is {default}"
-                    raise InputError(
-                        f"{name} must be in {rule.interval}, got {value!r:.{_LONGEST}}{remedy}"
-                    )
 
-            if rule.is_ascending and value is not None and value[0] > value[1]:
-                raise InputError(
-                    f"{name} must be a range, the lower end first, got {value}; turn it"
-                )
-            for divisor in rule.multiples_of:
-                if value % divisor:
-                    raise InputError(
-                        f"{name} must be a multiple of {divisor}, got {value}; take {default}"
-                    )
+def _check_entries(name: str, value: Any, rule: _Rule, default: Any) -> None:  # noqa: ANN401
+    """Refuse a value that is no allowed word or lies outside of the interval.
+
+    The rule applies to each entry of a tuple. ``default`` is named in the error, unless it is None.
+    """
+    entries = value if isinstance(value, tuple) else (value,)
+    for entry in entries:
+        if entry is None:
+            continue
+        if rule.choices and entry not in rule.choices:
+            refuse_unknown(name, entry, rule.choices)
+        if rule.interval and not _is_in_interval(entry, rule.interval):
+            remedy = "" if default is None else f"; the default is {default}"
+            raise InputError(
+                f"{name} must be in {rule.interval}, got {value!r:.{_LONGEST}}{remedy}"
+            )
+
+
+def _check_order(name: str, value: Any, rule: _Rule) -> None:  # noqa: ANN401
+    """Refuse a range whose lower end exceeds its upper end."""
+    if rule.is_ascending and value[0] > value[1]:
+        raise InputError(f"{name} must be a range, the lower end first, got {value}; swap the two")
+
+
+def _check_multiple(name: str, value: Any, rule: _Rule, default: Any) -> None:  # noqa: ANN401
+    """Refuse a number that is no multiple of each divisor; the error suggests one that is.
+
+    It is the default, or where that is None the next larger multiple.
+    """
+    for divisor in rule.multiples_of:
+        if value % divisor:
+            suggested = math.ceil(value / divisor) * divisor if default is None else default
+            raise InputError(
+                f"{name} must be a multiple of {divisor}, got {value}; take {suggested}"
+            )
 
 
 def _is_in_interval(number: float, interval: str) -> bool:
@@ -98,12 +118,12 @@ def _read_rules(kind: type) -> dict[str, _Rule]:
         # A Literal may be the type itself or a part of it, as in ``Literal["a", "b"] | None``.
         parts = (plain, *get_args(plain))
         literal = next((part for part in parts if get_origin(part) is Literal), None)
-        words = get_args(literal)
-        if not all(isinstance(word, str) for word in words):
-            words = ()
-        if words or interval or notes:
+        choices = get_args(literal)
+        if not all(isinstance(choice, str) for choice in choices):
+            choices = ()
+        if choices or interval or notes:
             rules[name] = _Rule(
-                words=words,
+                choices=choices,
                 interval=interval,
                 multiples_of=tuple(note for note in notes if note != ASCENDING),
                 is_ascending=ASCENDING in notes,

@@ -315,12 +315,14 @@ def read_settings(folder: Path | str) -> dict[str, Any] | None:
     if isinstance(folder, str) and "://" in folder:
         record = stores.join(folder, RECORD)
         with refused_as(record, "record of a run", "choose another folder"):
-            content = json.loads(stores.read_from(record)) if stores.exists(record) else None
+            if not stores.exists(record):
+                return None
+            content = json.loads(stores.read_from(record))
     else:
         record = Path(folder) / RECORD
-        content = read_json(record) if record.is_file() else None
-    if content is None:
-        return None
+        if not record.is_file():
+            return None
+        content = read_json(record)
     settings = content.get("settings") if isinstance(content, dict) else None
     if not isinstance(settings, dict):
         raise InputError(
@@ -417,7 +419,7 @@ def _read_stamp(file: Path) -> list[int]:
     return [status.st_size, status.st_mtime_ns]
 
 
-def is_whole(folder: Path, name: str, needed: Collection[str]) -> bool:
+def is_result_finished(folder: Path, name: str, needed: Collection[str]) -> bool:
     """Whether a result is noted as finished and its files are as they were written.
 
     Args:

@@ -252,21 +252,30 @@ def _add_selection_generator(
 def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
     """Add the warp of left views to right ones, as ``warp_left_to_right`` of ``synthesis`` does.
 
-    ``right_px``: disparity of the right views; ``size``: rows and columns.
+    Args:
+        left: (batch, 3, height, width).
+        right_px: disparity of the right views (batch, height, width).
+        size: height and width (2,).
     """
     graph = left.graph
-    row, column = (
-        graph.op("Range", 0, _slice_side(size, axis).op("Squeeze", [0]), 1).cast(np.float32)
-        for axis in (0, 1)
-    )
+    height = _slice_side(size, 0)
+    width = _slice_side(size, 1)
+
+    # The place in the left view of each pixel of the right one: rows (height, 1), columns (batch,
+    # height, width).
+    row = graph.op("Range", 0, height.op("Squeeze", [0]), 1).cast(np.float32).op("Unsqueeze", [1])
+    right_column = graph.op("Range", 0, width.op("Squeeze", [0]), 1).cast(np.float32)
+    left_column = right_px + right_column
+
     # GridSample's coordinates: -1 and 1 are the outer borders of the image.
-    y, x = (
-        (positions * _2 + _1) / _slice_side(size, axis).cast(np.float32) - _1
-        for axis, positions in enumerate((row.op("Unsqueeze", [1]), right_px + column))
-    )
+    y = (row * _2 + _1) / height.cast(np.float32) - _1
+    x = (left_column * _2 + _1) / width.cast(np.float32) - _1
+
+    # Its grid (batch, height, width, 2), of x and y.
     shape = right_px.op("Shape")
-    coordinates = (values.op("Expand", shape).op("Unsqueeze", [-1]) for values in (x, y))
-    grid = graph.op("Concat", *coordinates, axis=-1)
+    grid_x = x.op("Expand", shape).op("Unsqueeze", [-1])
+    grid_y = y.op("Expand", shape).op("Unsqueeze", [-1])
+    grid = graph.op("Concat", grid_x, grid_y, axis=-1)
     return left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
 
 

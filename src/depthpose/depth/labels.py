@@ -12,7 +12,7 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import atomic_write, write_depth_png, write_image
 from depthpose.core.files.disk import read_text
-from depthpose.core.run_folder import claim_folder, claim_names, is_whole, note_result
+from depthpose.core.run_folder import claim_folder, claim_names, is_result_finished, note_result
 from depthpose.depth.config import Settings
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import warp_right_to_left
@@ -124,7 +124,7 @@ def _read_named_rig(dataset: Dataset, index: int) -> StereoRig:
 
 def _is_labelled(folder: Path, name: str) -> bool:
     """Whether an earlier run wrote all files of a pair."""
-    return is_whole(folder, name, [f"disp_occ/{name}.png"])
+    return is_result_finished(folder, name, [f"disp_occ/{name}.png"])
 
 
 def label_pair(net: FakestereoNet, pair: DepthInput, config: LabelConfig) -> Map:

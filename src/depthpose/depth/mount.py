@@ -81,28 +81,28 @@ def find_mount(
 ) -> Ground:
     """Estimate the camera's height, tilt and roll above a road, with their standard deviations.
 
-    Height and tilt that the camera states are taken as they are. Else three estimates of the tilt
-    are averaged by their inverse variances: that of the road in the map, that of the frame before,
-    and that of the edges in the image (:func:`find_angles`). The height is that in the map,
-    corrected for the error of the map's tilt, and averaged over the frames.
+    Height and tilt that ``image.camera`` states are taken as they are. Otherwise three estimates of
+    the tilt are averaged by their inverse variances: that of the road in the depth map, that of the
+    frame before, and that of the edges in the image (:func:`find_angles`). The height is that in
+    the depth map, corrected for the error of its tilt, and averaged over the frames.
 
     Args:
         map_ground: the road in the depth map of the image (:func:`fit_ground`).
         image: the image and its camera.
-        before: the mount by the frames before, where they are of the same camera.
+        before: the mount by the frames before; None for the first frame of a camera.
         network: config of the network that estimated the map, which says by how much its roads are
             tilted too far.
     """
-    # The prior of the angles, which the edges of the image then improve.
+    # Prior angles by the depth map and the frame before, which the edges of the image improve.
     camera = image.camera
     assert camera is not None
     map_tilt_deg = map_ground.tilt_deg - network.road_tilt_off_deg
-    expected = _predict_angles(map_tilt_deg, map_ground.roll_deg, before)
+    prior = _predict_angles(map_tilt_deg, map_ground.roll_deg, before)
     if camera.tilt_deg is not None:
-        expected = replace(expected, tilt_deg=camera.tilt_deg, tilt_std_deg=_MEASURED_TILT_STD_DEG)
-    angles = find_angles(image.left, camera, expected)
+        prior = replace(prior, tilt_deg=camera.tilt_deg, tilt_std_deg=_MEASURED_TILT_STD_DEG)
+    angles = find_angles(image.left, camera, prior)
 
-    # Edges estimate the roll beside a tilt that is stated, but do not change that tilt.
+    # The edges estimate the roll, and the tilt where the camera does not state it.
     if camera.tilt_deg is not None:
         tilt_deg = camera.tilt_deg
         tilt_std_deg = _MEASURED_TILT_STD_DEG
@@ -117,6 +117,7 @@ def find_mount(
         tilt_error_deg = map_tilt_deg - tilt_deg
         height_m, height_std_share = _estimate_height(map_ground.height_m, tilt_error_deg, before)
 
+    # Rounded as files hold it, so that a rerun continues from the same values.
     values = {
         "height_m": height_m,
         "tilt_deg": tilt_deg,

@@ -15,7 +15,7 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import read_text, write_bytes
-from depthpose.core.run_folder import claim_folder, claim_names, is_whole, note_result
+from depthpose.core.run_folder import claim_folder, claim_names, is_result_finished, note_result
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.depth.config import COLOR_RANGE_M
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
@@ -131,7 +131,7 @@ def is_finished(folder: Path, name: str, *, with_cloud: bool = False) -> bool:
     ``with_cloud``: only an estimate with a cloud counts.
     """
     needed = (LAST, CLOUD) if with_cloud else (LAST,)
-    return is_whole(folder, name, [f"{name}.{ending}" for ending in needed])
+    return is_result_finished(folder, name, [f"{name}.{ending}" for ending in needed])
 
 
 def has_prediction(folder: Path, name: str, *, of_disparity: bool = False) -> bool:

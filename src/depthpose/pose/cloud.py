@@ -316,7 +316,7 @@ _MM_PER_UNIT = {"cm": 10.0, "inches": 25.4}
 # Size of a cloud over the diameter of its model.
 _LARGEST_RATIO = 1.5  # a cloud is part of its object; noise and grown masks make it somewhat larger
 _SMALLEST_RATIO = 0.1  # a smaller part of an object cannot be posed anyway
-_LIKELY_RATIO = 0.3  # least ratio at which a unit is suggested, of a cloud that is too large
+_LIKELY_RATIO = 0.3  # least corrected ratio at which a unit of a too large cloud is suggested
 _USUAL_RATIO = 0.7  # of a usual view of an object
 _LOG_RATIO_TIE = 0.3  # difference of log ratios up to which a unit fits nearly as well as the best
 
@@ -345,15 +345,16 @@ def advise_unit(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> Unit
     # Is the larger one in a smaller unit than metres?
     is_cloud_larger = ratio > 1
     larger, smaller = ("cloud", "model") if is_cloud_larger else ("model", "cloud")
-    # Five times too large is a mask of more than the object sooner than a sliver in inches.
-    least = _LIKELY_RATIO if is_cloud_larger else _SMALLEST_RATIO
-    units = _name_likely_units(ratio, least)
+    # A cloud 5x too large more likely comes from an oversized mask than from a small visible part
+    # in inches, so a larger visible share is required.
+    min_corrected_ratio = _LIKELY_RATIO if is_cloud_larger else _SMALLEST_RATIO
+    units = _name_likely_units(ratio, min_corrected_ratio)
     if units:
         times = max(ratio, 1 / ratio)
         message = f"your {larger} is {times:.0f} times larger than the {smaller}: is it in {units}?"
         return UnitAdvice(is_cloud_larger, message)
 
-    # Or is the smaller one in a larger unit than mm, where the other is in mm?
+    # Both may be in wrong units: the larger in mm, the smaller in cm or inches.
     likely: list[str] = []
     for unit, factor in _MM_PER_UNIT.items():
         corrected = ratio / factor if is_cloud_larger else ratio * factor
@@ -381,12 +382,12 @@ def _measure_size(points_m: Float[Tensor, "n 3"]) -> float:
     return 2 * float(distance_m.kthvalue(rank).values)
 
 
-def _name_likely_units(ratio: float, least: float) -> str:
+def _name_likely_units(ratio: float, min_corrected_ratio: float) -> str:
     """Name the units that the larger of cloud and model is likely in, where metres were assumed.
 
     Args:
         ratio: size of the cloud over the diameter of the model.
-        least: least ratio in the right unit.
+        min_corrected_ratio: least ratio in the right unit.
 
     Returns:
         The units, joined by "or"; empty where none explains the ratio.
@@ -394,7 +395,7 @@ def _name_likely_units(ratio: float, least: float) -> str:
     log_error_of_unit: dict[str, float] = {}
     for unit, factor in _UNITS_PER_METRE.items():
         corrected = ratio / factor if ratio > 1 else ratio * factor
-        if least <= corrected <= _LARGEST_RATIO:
+        if min_corrected_ratio <= corrected <= _LARGEST_RATIO:
             log_error_of_unit[unit] = abs(math.log(corrected / _USUAL_RATIO))
     best = min(log_error_of_unit.values(), default=0.0)
     return " or ".join(

@@ -67,14 +67,14 @@ def color_input(
 ) -> ColorImage:
     """Convert a picture to the colour image of a view.
 
-    With a camera of its own it may have any size and place. Without one it has the size and the
-    intrinsic matrix of the depth image, and no transform. Arguments and errors are those of
-    :func:`add_color`.
+    With ``camera`` the picture may have any size, and another place than the depth camera. Without
+    it the picture must be aligned to the depth image: it has its size and its intrinsic matrix, and
+    no transform. Arguments and errors are those of :func:`add_color`.
     """
     rgb = rgb_from_picture(color, f"{view.name}: the colour image")
     height, width = rgb.shape[1:]
 
-    # Of a camera of its own.
+    # A colour camera of its own.
     if camera is not None:
         K = _read_color_intrinsics(camera, width, height, view)
         transform = None
@@ -82,7 +82,7 @@ def color_input(
             transform = rigid_input(color_from_depth, "color_from_depth", "color_from_depth")
         return ColorImage(rgb=rgb, K=K, color_from_depth=transform)
 
-    # Of the depth camera: aligned to the depth image, pixel by pixel.
+    # No camera: aligned to the depth image, pixel by pixel.
     if color_from_depth is not None:
         raise InputError(
             f"{view.name}: color_from_depth is given, so the colour image is of another "

@@ -17,7 +17,7 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.data_frame import make_data_frame
 from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import write_json
-from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, write_bytes
+from depthpose.core.files.disk import read_bytes, refuse_heavy_text, refused_as, write_bytes
 from depthpose.core.rigid import Rigid, is_rigid
 from depthpose.core.runner import Job, Results
 from depthpose.pose.datasets import BopDataset, Instance
@@ -461,7 +461,7 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
     """
     # The lines of the file.
     data = read_bytes(path)
-    refuse_heavy(path, data, {b"\n": 300, b",": 60})
+    refuse_heavy_text(path, data, {b"\n": 300, b",": 60})
     with refused_as(path, "results file", "write it anew"):
         rows = list(csv.reader(data.decode("utf-8-sig").splitlines()))
     if not rows or [name.strip() for name in rows[0]] != _HEADER:

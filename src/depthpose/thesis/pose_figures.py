@@ -31,11 +31,11 @@ _SPECTRAL = (
 )  # fmt: skip
 
 
-def spectral(share: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
+def spectral(value: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
     """Look up the RGB colours, 0..1, of numbers from 0 (red) over yellow to 1 (blue)."""
     # Between the two colours of the scale beside each number.
     anchors = torch.tensor(_SPECTRAL, dtype=torch.float32) / 255
-    position = share.float().clamp(0, 1) * (len(anchors) - 1)
+    position = value.float().clamp(0, 1) * (len(anchors) - 1)
     below = position.long().clamp(max=len(anchors) - 2)
     return torch.lerp(anchors[below], anchors[below + 1], (position - below)[:, None])
 
@@ -125,20 +125,20 @@ def compute_features(
     return grid.points_m, network.features(voxels).at_points().float()
 
 
-def draw_features(
+def draw_colored_cloud(
     points_m: Float[Tensor, "n 3"],
-    share: Float[Tensor, " n"],
+    value: Float[Tensor, " n"],
     model: ObjectModel,
     size_px: int = 400,
 ) -> Float[Tensor, "3 size size"]:
     """Draw a cloud in colours over its model in black, both in the model's frame.
 
-    The projection is parallel, from the side that the cloud was seen from, so that the model does
-    not occlude it; the model's z axis is up.
+    The projection is parallel, roughly from the side that the cloud was seen from, so that the
+    cloud faces the viewer; the model's z axis is up. The cloud is drawn last, over the model.
 
     Args:
         points_m: the cloud, in the model's frame.
-        share: value of each point, 0 to 1, for its colour (:func:`spectral`).
+        value: of each point, 0 to 1, for its colour (:func:`spectral`).
         model: the object.
         size_px: width and height of the picture.
     """
@@ -156,7 +156,7 @@ def draw_features(
     canvas = Image.new("RGB", (size_px, size_px), "white")
     pen = ImageDraw.Draw(canvas)
     draw_discs(pen, surface_px, torch.zeros(len(surface_m), 3), 1.0)
-    draw_discs(pen, cloud_px, spectral(share), max(_MIN_DISC_PX, size_px / _RADII_PER_SIDE))
+    draw_discs(pen, cloud_px, spectral(value), max(_MIN_DISC_PX, size_px / _RADII_PER_SIDE))
     return rgb_from_pillow(canvas, "figure 3-2")
 
 

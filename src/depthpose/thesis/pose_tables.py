@@ -33,10 +33,10 @@ _LINEMOD_NUMBERS = {name.rstrip("*"): number for number, name in LINEMOD.items()
     "bowl": 3, "cam": 4, "cup": 7,
 }  # fmt: skip
 """BOP's number of each object, by its name in any of the published forms of LineMOD."""
-_SAME_DIAMETER = 0.02
-"""Largest relative difference of the diameters of one object, where the model has no name."""
-_SAME_NAMED = 0.25
-"""The same where the names agree: tables of LineMOD's diameters differ by up to 16 %."""
+_TOLERANCE_UNNAMED = 0.02
+"""Largest relative difference from LineMOD's diameter, of a model without a name."""
+_TOLERANCE_NAMED = 0.25
+"""The same of a model with the object's name: tables of the diameters differ by up to 16 %."""
 
 PEERS = ("PointFusion", "DenseFusion, per pixel", "DenseFusion, iterative")
 """Methods of one network for all objects, as ours is; their rows are subtracted from ours."""
@@ -92,19 +92,20 @@ ROWS = (
 def find_linemod_number(model: ObjectModel) -> int:
     """Find which object of LineMOD a model is, by its name and diameter; return BOP's number of it.
 
-    A model without a name of its own, only ``obj_000006``, is known by that number and its
-    diameter.
+    A model without a name, only ``obj_000006``, is recognised by that number and its diameter.
 
     Raises:
         InputError: it is no object of LineMOD.
     """
     is_named = model.name != f"obj_{model.number:06d}"
-    number = _LINEMOD_NUMBERS.get(model.name.lower(), 0) if is_named else model.number
-    diameter_m = LINEMOD_DIAMETERS_M.get(number, 0.0)
-    largest_difference = _SAME_NAMED if is_named else _SAME_DIAMETER
-    if abs(diameter_m / model.diameter_m - 1) <= largest_difference:
-        return number
-    remark = f"; LineMOD's object {number} is {diameter_m:.4f} m" if diameter_m else ""
+    number = _LINEMOD_NUMBERS.get(model.name.lower()) if is_named else model.number
+    remark = ""
+    if number in LINEMOD_DIAMETERS_M:
+        diameter_m = LINEMOD_DIAMETERS_M[number]
+        tolerance = _TOLERANCE_NAMED if is_named else _TOLERANCE_UNNAMED
+        if abs(diameter_m / model.diameter_m - 1) <= tolerance:
+            return number
+        remark = f"; LineMOD's object {number} is {diameter_m:.4f} m"
     raise InputError(
         f"object {model.number} ({model.name}, {model.diameter_m:.4f} m across) is none of "
         f"LineMOD{remark}. Table 3.2 compares with numbers of LineMOD's objects; for other "

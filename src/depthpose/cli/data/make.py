@@ -292,10 +292,10 @@ def _render_scene(
 def _has_whole_scene(out: Path, split: str, scene: int, frames: range) -> bool:
     """Whether a scene exists with all of its frames, every file as it was written."""
     from depthpose.core.files import read_json
-    from depthpose.core.run_folder import is_whole
+    from depthpose.core.run_folder import is_result_finished
 
     scene_folder = f"{split}/{scene:06d}"
-    if not is_whole(out, scene_folder, [f"{scene_folder}/scene_camera.json"]):
+    if not is_result_finished(out, scene_folder, [f"{scene_folder}/scene_camera.json"]):
         return False
     frames_of_scene = read_json(out / scene_folder / "scene_camera.json")
     return isinstance(frames_of_scene, dict) and {str(n) for n in frames} <= set(frames_of_scene)

@@ -95,8 +95,9 @@ def match_pairs(
 ) -> int:
     """Match real stereo pairs to metric depth.
 
-    For each NAME.png on the left the files of 'depth predict', but for the right view: depth in
-    metres, disparity, confidence, sky, colours, and the cloud with --cloud. report.html shows some.
+    For each left image NAME.png it writes the files of 'depth predict' except the right view: depth
+    in metres, disparity, confidence, sky, colours, and the cloud with --cloud. report.html shows
+    some.
     A rerun skips what is finished; other settings need another --out.
 
         depthpose depth match left.png right.png --camera cam.json --out out
@@ -130,25 +131,26 @@ def match_pairs(
     )
     spec = make_pair_spec(pairs.matcher, pairs.weights, config, with_check=pairs.check)
 
-    # By workers of a cluster, to which the weights travel.
+    # By workers of a cluster. The weights are packed into the spec, which is sent to them.
     if engine.engine == "ray":
-        packed = spec.with_packed_weights()
-        sides = [left] if right is None else [left, right]
-        inputs = find_inputs_for_ray(sides, PAIRS)
+        packed_spec = spec.with_packed_weights()
+        sources = [left] if right is None else [left, right]
+        inputs = find_inputs_for_ray(sources, PAIRS)
         with inputs.open_first() as first_pair:
             rig = read_rig(camera, image_size(first_pair[0]))
         reader = InputReader(camera=rig, files=PAIRS)
-        worker = DepthWorker(spec=packed, reader=reader, output=output)
+        worker = DepthWorker(spec=packed_spec, reader=reader, output=output)
         return predict_depth_on_ray(inputs, worker, out, engine)
 
     # In this process.
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it second")
-    files = list_pairs(left, right)
-    refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
-    rig = read_rig(camera, image_size(files[0][0]))
+    image_pairs = list_pairs(left, right)
+    images = [path for pair in image_pairs for path in pair]
+    refuse_among_inputs(Path(out), (left, right), images)
+    rig = read_rig(camera, image_size(image_pairs[0][0]))
     reader = InputReader(camera=rig, files=PAIRS)
-    return predict_depth_of_files(files, spec.build(), reader, output, Path(out))
+    return predict_depth_of_files(image_pairs, spec.build(), reader, output, Path(out))
 
 
 def evaluate_depth(

@@ -161,7 +161,7 @@ def wait_for_results(sources: Sequence[tuple[Path, ...]], out: Path, *, with_clo
         if name in run_folder.read_failures(out):
             return True
         if name in videos:
-            return run_folder.is_whole(out, name, [_name_video_file(videos[name])])
+            return run_folder.is_result_finished(out, name, [_name_video_file(videos[name])])
         return is_finished(out, name, with_cloud=with_cloud)
 
     names = [_name_source(files) for files in sources]

@@ -170,10 +170,10 @@ def track_object(
 
     Each frame starts from the pose of the one before and needs ICP alone. Where the depth
     contradicts the pose, the object is detected again in that frame; where that fails too,
-    the frame is lost, and the next is searched. poses.json says of each frame which of the three it
-    was ("tracking"); else the files are those of 'pose predict'. Frames are taken in the order of
-    their names, numbers in them by value (2 before 10). A rerun begins anew; what an interrupted
-    one has found is in poses.json.
+    the frame is lost, and the next is searched. In poses.json "tracking" is tracked, found
+    (detected again) or lost for each frame; otherwise the files are those of 'pose predict'. Frames
+    are taken in the order of their names, numbers in them by value (2 before 10). A rerun begins
+    anew; what an interrupted one has found is in poses.json.
 
         depthpose pose track --depth frames --camera cam.json --object mug --out out
         depthpose pose track --bop lm --split test --weights linemod.safetensors --out out
@@ -202,5 +202,5 @@ def track_object(
     method = spec.build()
     if method.estimator.needs_mask:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
-    follow = track_files if frames.bop is None else track_dataset
-    return follow(method, frames, out)
+    track = track_files if frames.bop is None else track_dataset
+    return track(method, frames, out)

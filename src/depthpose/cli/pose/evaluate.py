@@ -254,7 +254,9 @@ def _list_success_by_masks(measured: Evaluation) -> list[dict[str, Any]]:
 def _make_instance_sections(
     dataset: BopDataset, predictions: Path, rows: Sequence[InstanceRow], max_count: int
 ) -> list[Section]:
-    """Make sections of some instances, with their estimates and true poses.
+    """Make sections of the worst, the median and the best posed instance, and of a refused one.
+
+    Each shows the estimate and the true pose.
 
     Args:
         dataset: the instances.
@@ -267,18 +269,18 @@ def _make_instance_sections(
         dataset.instances, read_any_predictions(predictions), dataset.objects
     )
     sections: list[Section] = []
-    for role, row in _choose_instances(rows, max_count):
+    for caption, row in _choose_instances(rows, max_count):
         instance = instances[row.instance]
         estimate = estimates[row.instance]
         model = dataset.objects[instance.object_id]
         # The true pose of a symmetric object has copies; the one nearest to the estimate is drawn.
         truth = instance.camera_from_model
         if (pose := estimate.camera_from_model) is not None:
-            symmetries = symmetry_transforms(model.symmetries)
-            truth = find_nearest_copy(pose, truth, symmetries, model.symmetries)
+            transforms = symmetry_transforms(model.symmetries)
+            truth = find_nearest_copy(pose, truth, transforms, declared=model.symmetries)
         columns = row.columns()
         section = make_pose_section(
-            f"{predictions.stem}: {row.object} in {row.instance}, {role}",
+            f"{predictions.stem}: {row.object} in {row.instance}, {caption}",
             dataset.view(instance).input,
             estimate,
             model,
@@ -315,7 +317,7 @@ def _choose_instances(rows: Sequence[InstanceRow], max_count: int) -> list[tuple
     Posed instances are ranked by their error, as a share of the diameter.
 
     Returns:
-        Words for the section of each, and its row; ``max_count`` at most.
+        The caption of each, such as "worst answer of 12", and its row; ``max_count`` at most.
     """
     posed: list[InstanceRow] = []
     refused: list[InstanceRow] = []
@@ -329,8 +331,8 @@ def _choose_instances(rows: Sequence[InstanceRow], max_count: int) -> list[tuple
             refused.append(row)
 
     chosen = [
-        (f"{role} answer of {len(posed)}", posed[k])
-        for role, k in page.choose_ranked(relative_errors, max_count)
+        (f"{rank} answer of {len(posed)}", posed[k])
+        for rank, k in page.choose_ranked(relative_errors, max_count)
     ]
     refused_count = min(max_count - len(chosen), 1)
     chosen += [

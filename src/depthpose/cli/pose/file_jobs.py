@@ -100,34 +100,35 @@ def make_mask_jobs(
         depth: a depth image, or a folder of them.
         mask: its mask, or a folder of masks with the names of the depth images.
         camera: camera file, or focal length [px].
-        object: what all masks show; None: what ``labels`` say.
+        object: name of the object that all masks show; may be None beside ``labels``.
         unit: unit of the depth images; None: the camera says it.
         out: folder of the results, which may not lie among the inputs.
-        labels: object of each number of a mask; None: all numbers are of ``object``.
+        labels: name of the object by the number in a mask; None: every number is an ``object``.
 
     Raises:
         InputError: files are missing or do not match, or two results would have one name.
     """
-    # In a folder, files of run lengths (.json) are taken in place of pictures.
+    # The mask of each depth image. If a folder has files of run lengths (.json), its pictures are
+    # not taken.
     run_length_files = sorted(mask.glob("*.json")) if mask.is_dir() else []
-    depths = list_depths(depth)
+    depth_files = list_depths(depth)
     mask_files = run_length_files or list_images(mask)
-    refuse_among_inputs(out, [depth, mask], [*depths, *mask_files])
-    masks = match_to_depths(depths, mask_files, depth, mask, "mask")
+    refuse_among_inputs(out, [depth, mask], [*depth_files, *mask_files])
+    mask_of_depth = match_to_depths(depth_files, mask_files, depth, mask, "mask")
 
     jobs: list[PoseJob[Any]] = []
-    for path in depths:
-        mask_file = masks[path.stem]
+    for depth_file in depth_files:
+        mask_file = mask_of_depth[depth_file.stem]
         if labels is not None:
             parts = _split_by_label(mask_file, labels, object)
         else:
             assert object is not None
             parts = _split_by_number(mask_file, object)
         for part in parts:
-            name = path.stem + part.ending
-            read = partial(view_input, path, part.mask, camera, part.object, name, unit)
-            files = (path, mask_file)
-            jobs.append(PoseJob(name=name, read=read, object=part.object, source=files))
+            name = depth_file.stem + part.ending
+            read = partial(view_input, depth_file, part.mask, camera, part.object, name, unit)
+            source = (depth_file, mask_file)
+            jobs.append(PoseJob(name=name, read=read, object=part.object, source=source))
     _refuse_equal_names(jobs, depth)
     return jobs
 

@@ -241,30 +241,30 @@ def make_method_spec(
     unit: Unit | None,
     dataset: DataSetOptions | SequenceOptions,
     config: EstimateConfig,
-    base: Sequence[str] = (),
+    base_words: Sequence[str] = (),
     *,
     is_registration: bool,
 ) -> PoseMethodSpec:
-    """Make the spec of an estimator: of a network, or of models of a dataset or of CAD files.
+    """Make the spec of a network, or of the registration of models of a dataset or of CAD files.
 
     Args:
-        weights: name or file of the weights of a network.
-        parts: CAD files, their unit and their symmetries.
-        unit: unit of CAD files where ``parts`` has none.
-        dataset: dataset whose models are registered where there is one.
+        weights: name or file of the weights; unused in a registration.
+        parts: options of the CAD files, their unit and their symmetries.
+        unit: unit of the CAD files where ``parts`` has none.
+        dataset: options of the dataset; if they name one, its models are registered, not CAD files.
         config: settings of the estimator.
-        base: words of ``--base-from-camera``; none where a dataset is posed.
+        base_words: words of ``--base-from-camera``; none where a dataset is posed.
         is_registration: register models, without the network.
 
     Raises:
         InputError: a file cannot be read, or a unit is missing.
     """
-    base_from_camera = read_base(base)
+    base_from_camera = read_base(base_words)
     cad_unit = find_cad_unit(parts.cad, parts.cad_unit, unit)
     if not is_registration:
         return PoseNetworkSpec(weights=weights, config=config, base_from_camera=base_from_camera)
     if dataset.bop is not None:
-        # No base: --base-from-camera is refused beside --bop, since a dataset's cameras move.
+        # No base_from_camera: it is refused beside --bop, since a dataset's cameras move.
         models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())
         return RegistrationSpec(models=models, config=config)
     models = read_parts(parts.cad, cad_unit, parts.symmetry or None)

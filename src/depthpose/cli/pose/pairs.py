@@ -17,7 +17,7 @@ from depthpose.core.errors import InputError, result_or_error
 from depthpose.core.files import image_size, read_map, write_map
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.processes import find_rank
-from depthpose.core.run_folder import claim_folder, is_whole, note_result
+from depthpose.core.run_folder import claim_folder, is_result_finished, note_result
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.disparity import depth_std_from_confidence
 
@@ -37,16 +37,16 @@ class MatchedPairs(NamedTuple):
 
 
 def match_pairs_for_poses(
-    pair: PairOptions, camera: Path | None, device: str, out: Path
+    options: PairOptions, camera: Path | None, device: str, out: Path
 ) -> MatchedPairs:
     """Match pairs, and write their depth as input of an estimate of poses.
 
     OUT/matched gets what 'depth match' writes, OUT/depth the depth [m] whose confidence is
-    ``pair.min_confidence`` at least, and OUT/depth_std its standard deviation [m]. A rerun does not
-    match again. A pair without depth that is sure enough is named, and stops no other.
+    ``options.min_confidence`` at least, and OUT/depth_std its standard deviation [m]. A rerun does
+    not match again. A pair without depth that is sure enough is named, and stops no other.
 
     Args:
-        pair: left and right images, what matches them, and the least confidence.
+        options: left and right images, or their folders; what matches them; the least confidence.
         camera: file of the rig, with its baseline.
         device: device that the matcher runs on.
         out: folder of the run.
@@ -55,26 +55,28 @@ def match_pairs_for_poses(
         InputError: an image has no partner, a camera no baseline, or no pair has depth that is sure
             enough.
     """
-    assert pair.left is not None
-    assert pair.right is not None
+    assert options.left is not None
+    assert options.right is not None
     assert camera is not None
-    pairs = list_pairs(pair.left, pair.right)
+    pairs = list_pairs(options.left, options.right)
     images = [path for both in pairs for path in both]
-    refuse_among_inputs(out, (pair.left, pair.right), images)
-    spec = make_pair_spec(pair.matcher, "default", MatcherConfig(device=device))
+    refuse_among_inputs(out, (options.left, options.right), images)
+    spec = make_pair_spec(options.matcher, "default", MatcherConfig(device=device))
     rig = read_rig(camera, image_size(pairs[0][0]))
     reader = InputReader(camera=rig, files=PAIRS)
     exit_code = predict_depth_of_files(pairs, spec.build(), reader, PredictOutput(), out / MATCHED)
-    if find_rank().world > 1:  # every process poses its share of all pairs
+    if find_rank().world > 1:
+        # This process has matched its share of the pairs, and all need the results of the others.
         wait_for_results(pairs, out / MATCHED, with_cloud=False)
 
     names = [left.stem for left, _ in pairs]
-    if not _write_all_sure_depth(names, rig, pair.min_confidence, out):
+    if not _write_all_sure_depth(names, rig, options.min_confidence, out):
         exit_code = 1
-    if len(names) == 1:  # a single depth image may have a mask of any name
+    if len(names) == 1:
+        # A file, not its folder: masks of a folder are matched by name, and that of a file is not.
         return MatchedPairs(out / DEPTH / f"{names[0]}.npy", exit_code)
     if not any((out / DEPTH / f"{name}.npy").is_file() for name in names):
-        raise InputError(f"{pair.left}: no pair has depth, for the reasons above; correct these")
+        raise InputError(f"{options.left}: no pair has depth, for the reasons above; correct these")
     _remove_depth_of_others(names, out)
     return MatchedPairs(out / DEPTH, exit_code)
 
@@ -82,7 +84,7 @@ def match_pairs_for_poses(
 def _write_all_sure_depth(
     names: Sequence[str], rig: StereoRig, min_confidence: float, out: Path
 ) -> bool:
-    """Write the sure depth of every matched pair; return whether none failed.
+    """Write the depth of every matched pair where it is sure enough; return whether none failed.
 
     Raises:
         InputError: every pair failed.
@@ -107,21 +109,32 @@ def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Pat
     """Write the depth of a matched pair where it is sure enough, and its standard deviation.
 
     Nothing is written of a pair that could not be matched, or that an earlier run has finished.
+
+    Args:
+        name: name of the pair's results.
+        rig: cameras of the pair.
+        min_confidence: confidence from which depth is sure enough.
+        out: folder of the run.
+
+    Raises:
+        InputError: no depth is sure enough.
     """
     matched_folder = out / MATCHED
-    if not is_whole(matched_folder, name, [f"{name}.depth_m.npy"]):
+    if not is_result_finished(matched_folder, name, [f"{name}.depth_m.npy"]):
         return
     settings = {"min_confidence": min_confidence}
     folders = [out / DEPTH, out / DEVIATION]
     for folder in folders:
         claim_folder(folder, settings)
-    if all(is_whole(folder, name, [f"{name}.npy"]) for folder in folders):
+    if all(is_result_finished(folder, name, [f"{name}.npy"]) for folder in folders):
         return
 
     depth_m = read_map(matched_folder / f"{name}.depth_m.npy")
+    # A matcher without confidence is trusted everywhere.
     confidence = torch.ones_like(depth_m)
-    if (matched_folder / f"{name}.confidence.npy").is_file():
-        confidence = read_map(matched_folder / f"{name}.confidence.npy")
+    confidence_file = matched_folder / f"{name}.confidence.npy"
+    if confidence_file.is_file():
+        confidence = read_map(confidence_file)
     is_sure = confidence >= min_confidence
     sure_m = torch.where(is_sure, depth_m, torch.nan)
     if not bool(sure_m.isfinite().any()):
@@ -130,9 +143,9 @@ def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Pat
             "give a lower --min-confidence"
         )
 
-    left_out = 1 - float(sure_m.isfinite().sum() / depth_m.isfinite().sum())
+    unsure = 1 - float(sure_m.isfinite().sum() / depth_m.isfinite().sum())
     print(
-        f"{name}: {left_out:.1%} of the depth is less sure than {min_confidence:g} and left out",
+        f"{name}: {unsure:.1%} of the depth is less sure than {min_confidence:g} and left out",
         file=sys.stderr,
     )
 

@@ -73,7 +73,7 @@ def plan_searches(
     Args:
         method: finds the objects.
         inputs: options that name the files.
-        objects: names of the objects.
+        objects: names of the objects, one at least.
         out: folder of the results, which may not lie among the inputs.
 
     Raises:
@@ -81,6 +81,7 @@ def plan_searches(
     """
     assert inputs.depth is not None
     assert inputs.lens is not None
+    # A job has a single object: here any one, since the search looks for all of them.
     jobs = make_depth_jobs(Path(inputs.depth), inputs.lens, objects[0], inputs.unit, out)
     settings = {
         "find": sorted(objects),

@@ -42,16 +42,16 @@ def read_pose(path: Path, option: str = "--first", transform: str = "camera_from
 
 
 def _read_only_pose(path: Path, option: str) -> Rigid:
-    """Read the pose of a ``poses.json`` that holds exactly one."""
-    estimates = [
-        predictions.parse_prediction(row, f"{path}: entry {i}").estimate
-        for i, row in enumerate(read_rows(path))
-    ]
-    poses = [
-        estimate.camera_from_model
-        for estimate in estimates
-        if estimate.camera_from_model is not None
-    ]
+    """Read the pose of a ``poses.json`` that holds exactly one; ``option`` named the file.
+
+    Raises:
+        InputError: there are several poses, or none.
+    """
+    poses: list[Rigid] = []
+    for index, row in enumerate(read_rows(path)):
+        estimate = predictions.parse_prediction(row, f"{path}: entry {index}").estimate
+        if estimate.camera_from_model is not None:  # else it was refused
+            poses.append(estimate.camera_from_model)
     if len(poses) != 1:
         raise InputError(
             f"{option} {path}: holds {len(poses)} poses; give a poses.json of one, or a text file "

@@ -275,7 +275,7 @@ def reproduce_voting(
         weights: name or file of the network's weights.
         data: the dataset; without a folder the views are synthetic.
         synthetic: number of synthetic views.
-        points: most voting points of a view, for each block.
+        points: maximum voting points per view, one block of rows for each.
         out: folder of the files.
 
     Returns:
@@ -286,7 +286,7 @@ def reproduce_voting(
     if data.folder is None:
         views = _render_views(net, synthetic)
     else:
-        views = _read_views(net, data.folder, data, None)
+        views = _read_views(net, data.folder, data, number=None)
     sha256 = file_sha256(path)
     columns = {"weights": path.stem, "weights_sha256": sha256[:12], **views.columns}
     settings = {
@@ -298,10 +298,10 @@ def reproduce_voting(
     claim_folder(out, settings, [*page.list_table_files("rows"), "report.md", "report.html"])
 
     rows: list[dict[str, Any]] = []
-    for count in points:
-        samples = tqdm(views.samples, f"{count} points", disable=None)
-        cases = list(collect_votes(net, samples, count))
-        rows += [row | columns for row in compare_voting(cases, count)]
+    for max_points in points:
+        samples = tqdm(views.samples, f"{max_points} points", disable=None)
+        cases = list(collect_votes(net, samples, max_points))
+        rows += [row | columns for row in compare_voting(cases, max_points)]
     page.write_table(out, rows)
 
     text = (
@@ -399,7 +399,7 @@ def draw_feature_panels(net: GeoPoseNet, views: ThesisViews, perplexity: float) 
     for view, view_points_m, view_values in zip(usable, points_m, values, strict=True):
         model_from_camera = view.truth.camera_from_model.inverse()
         local_m = model_from_camera.apply(view_points_m[::step].to(model_from_camera.R))
-        image = pose_figures.draw_features(local_m, view_values, models[view.input.object])
+        image = pose_figures.draw_colored_cloud(local_m, view_values, models[view.input.object])
         panels.append(Drawing(image=image, caption=view.input.name))
     return panels
 

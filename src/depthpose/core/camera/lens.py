@@ -6,7 +6,7 @@ fisheye, and a fisheye whose coefficients are 0 still distorts.
 
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from depthpose.core.errors import InputError
 
@@ -70,27 +70,61 @@ def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | Non
     Raises:
         InputError: the lens is neither, or two names contradict each other.
     """
-    named_lenses: dict[str, tuple[str, bool]] = {}  # by key the name, and whether it is a fisheye
-    for key in (*_MODEL_KEYS, *_OTHER_KEYS):
-        value = fields.get(key)
-        is_realsense = "ppx" in fields
-        if is_realsense and isinstance(value, int) and not isinstance(value, bool):
-            value = _REALSENSE[value] if 0 <= value < len(_REALSENSE) else None
-        if not isinstance(value, str):
-            continue
-        lens = re.sub(r"[^a-z0-9]", "", value.lower())
-        # Without what only says that it is a lens: "pinhole camera", "distortion ftheta".
-        lens = re.sub(r"^(rs2?)?distortion|(camera|lens|model)+$", "", lens)
-        if lens in _REFUSED or lens.startswith("mei") or _is_other_lens(lens, key):
-            remedy = _REFUSED.get(lens, _BY_ITS_TOOL)
-            raise _make_lens_error(f"{owner} {_spell_key(key)} is {value!r}", remedy)
-        if lens in _RADIAL or lens in _FISHEYE:
-            named_lenses[key] = (value, lens in _FISHEYE)
-    for key in _FISHEYE_FLAGS:
-        if _is_set(fields.get(key)):
-            named_lenses[key] = (str(fields[key]), True)
+    lenses = _read_named_lenses(fields, owner)
+    _refuse_omnidirectional(fields, owner)
+    kinds = {lens.is_fisheye for lens in lenses}
+    if len(kinds) == 2:
+        shown = " and ".join(f"{_spell_key(lens.key)} {lens.name!r}" for lens in lenses)
+        raise InputError(f"{owner} lens is named twice, as {shown}; keep the true one")
+    return kinds.pop() if kinds else None
 
-    # The coefficient xi, alone or among those of a lens, is of MEI's model.
+
+class _NamedLens(NamedTuple):
+    """A lens with distortion that a camera file names."""
+
+    key: str  # key of the file
+    name: str  # its value, as the file spells it
+    is_fisheye: bool
+
+
+def _read_named_lenses(fields: Mapping[str, Any], owner: str) -> list[_NamedLens]:
+    """Read the lenses with distortion that a camera file names; arguments as above.
+
+    Raises:
+        InputError: a lens is neither a pinhole nor an equidistant fisheye.
+    """
+    lenses: list[_NamedLens] = []
+    for key in (*_MODEL_KEYS, *_OTHER_KEYS):
+        name = _read_lens_name(fields, key)
+        if name is None:
+            continue
+        # Without what only says that it is a lens: "pinhole camera", "distortion ftheta".
+        model = re.sub(r"[^a-z0-9]", "", name.lower())
+        model = re.sub(r"^(rs2?)?distortion|(camera|lens|model)+$", "", model)
+        if model in _REFUSED or model.startswith("mei") or _is_other_lens(model, key):
+            remedy = _REFUSED.get(model, _BY_ITS_TOOL)
+            raise _make_lens_error(f"{owner} {_spell_key(key)} is {name!r}", remedy)
+        if model in _RADIAL or model in _FISHEYE:
+            lenses.append(_NamedLens(key, name, is_fisheye=model in _FISHEYE))
+    set_flags = [key for key in _FISHEYE_FLAGS if _is_set(fields.get(key))]
+    flagged_lenses = [_NamedLens(key, str(fields[key]), is_fisheye=True) for key in set_flags]
+    return [*lenses, *flagged_lenses]
+
+
+def _read_lens_name(fields: Mapping[str, Any], key: str) -> str | None:
+    """Read the name of a lens at a key; None where there is none.
+
+    In files of librealsense, which have a ``ppx``, it may be the number of a model.
+    """
+    value = fields.get(key)
+    is_realsense = "ppx" in fields
+    if is_realsense and isinstance(value, int) and not isinstance(value, bool):
+        return _REALSENSE[value] if 0 <= value < len(_REALSENSE) else None
+    return value if isinstance(value, str) else None
+
+
+def _refuse_omnidirectional(fields: Mapping[str, Any], owner: str) -> None:
+    """Refuse a lens of MEI's model: only it has the coefficient xi, alone or among others."""
     for key, value in fields.items():
         xi = value if key == "xi" else None
         if isinstance(value, Mapping):
@@ -99,14 +133,6 @@ def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | Non
             raise _make_lens_error(
                 f"{owner} xi is {xi}, of MEI's omnidirectional model", _OMNIDIRECTIONAL
             )
-
-    kinds = {is_fisheye for _, is_fisheye in named_lenses.values()}
-    if len(kinds) == 2:
-        shown = " and ".join(
-            f"{_spell_key(key)} {name!r}" for key, (name, _) in named_lenses.items()
-        )
-        raise InputError(f"{owner} lens is named twice, as {shown}; keep the true one")
-    return kinds.pop() if kinds else None
 
 
 def _is_other_lens(lens: str, key: str) -> bool:

@@ -31,7 +31,7 @@ AnyPath = str | os.PathLike[str]
 MAX_FILE_BYTES = 2**28  # largest file that is read whole; a larger one is a mistake or an attack
 MAX_TEXT_BYTES = 2**26  # largest text: a million points, annotations of ten thousand images
 MAX_LIST_BYTES = 2**20  # largest text of a few numbers: a calibration, a camera, a config
-_MAX_JSON_MEMORY = 700_000_000  # memory of JSON once it is read, estimated from its text [bytes]
+_MAX_PARSED_BYTES = 700_000_000  # memory of a text once it is parsed, estimated from its signs
 _MAX_YAML_DEPTH = 50  # most lists within lists of YAML
 _MAX_YAML_VALUES = 2_000_000  # most values of YAML once its references are written out
 _SAFE_LOADER: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -363,7 +363,7 @@ def read_json(path: AnyPath) -> object:
             repeated key, or would fill the memory.
     """
     text = read_text(path, MAX_FILE_BYTES)
-    refuse_heavy(path, text.encode(), _JSON_SIGN_BYTES)
+    refuse_heavy_text(path, text.encode(), _JSON_SIGN_BYTES)
     with refused_as(path, "JSON file", "correct it there"):
         return json.loads(
             text,
@@ -383,25 +383,28 @@ def _make_json_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return members
 
 
-def refuse_heavy(path: AnyPath, data: bytes, memory_of: Mapping[bytes, int]) -> None:
-    """Refuse JSON that would fill the memory, before it is parsed.
+def refuse_heavy_text(path: AnyPath, data: bytes, memory_of_sign: Mapping[bytes, int]) -> None:
+    """Refuse JSON, YAML or CSV that would fill the memory once it is parsed, before that.
 
     Args:
         path: the file, for the error.
         data: its bytes.
-        memory_of: memory [bytes] of the Python object that begins with a sign of the text.
+        memory_of_sign: by a sign such as ``[``, the memory [bytes] of the Python object that begins
+            with it.
 
     Raises:
         InputError: the estimated memory is too large.
     """
-    # The bytes themselves, and Python's text: 1 byte a letter of ASCII, else up to 4.
-    bytes_a_letter = 2 if data.isascii() else 5
+    # The data, and Python's text of it: 1 byte a letter of ASCII, else up to 4.
+    bytes_a_letter = 1 + (1 if data.isascii() else 4)
     memory_bytes = bytes_a_letter * len(data)
-    memory_bytes += sum(size * data.count(sign) for sign, size in memory_of.items())
-    if memory_bytes > _MAX_JSON_MEMORY:
+    # The objects, of which each sign begins one.
+    for sign, object_bytes in memory_of_sign.items():
+        memory_bytes += object_bytes * data.count(sign)
+    if memory_bytes > _MAX_PARSED_BYTES:
         raise InputError(
             f"{path}: {len(data)} bytes that would take about {memory_bytes / 1e6:.0f} MB of "
-            f"memory, more than the {_MAX_JSON_MEMORY / 1e6:.0f} MB allowed; split it"
+            f"memory, more than the {_MAX_PARSED_BYTES / 1e6:.0f} MB allowed; split it"
         )
 
 
@@ -476,14 +479,15 @@ def write_json(path: AnyPath, value: object) -> None:
 def read_key_values(path: AnyPath) -> dict[str, list[float]]:
     """Read ``KEY: numbers`` lines, as of KITTI's calibrations: the numbers by key.
 
-    ``key=[a b; c d]``, as of Middlebury's, is read row by row. Keys of other values, such as dates,
+    ``key=[a b; c d]``, as of Middlebury's, is read row by row. Keys of words alone, such as dates,
     are left out, and so are blank lines and what follows ``#``.
 
     Raises:
-        InputError: the file is missing or not text, a line has no key or repeats one, or a number
-            is not finite.
+        InputError: the file is missing or not text, a line has no key, repeats one or mixes numbers
+            and words, or a number is not finite.
     """
-    values: dict[str, list[float]] = {}
+    keys: set[str] = set()  # of all lines, those of words too
+    numbers_of_key: dict[str, list[float]] = {}
     for number, line in enumerate(read_text(path, MAX_LIST_BYTES).splitlines(), start=1):
         text = line.partition("#")[0].strip()
         if not text:
@@ -491,16 +495,29 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
         match = _KEY_VALUE.fullmatch(text)
         if match is None:
             raise InputError(f"{path}: line {number}, {text[:60]!r}, is not 'KEY: numbers'")
-        if match[1] in values:
-            raise InputError(f"{path}: line {number} gives {match[1]!r} again; keep one of them")
+        key, content = match.groups()
+        if key in keys:
+            raise InputError(f"{path}: line {number} gives {key!r} again; keep one of them")
+        keys.add(key)
+
+        # Numbers alone, or words alone.
         numbers: list[float] = []
-        with suppress(ValueError):  # a date, or other words
-            numbers = [float(word) for word in match[2].translate(_BRACKETS_TO_BLANKS).split()]
+        others: list[str] = []
+        for word in content.translate(_BRACKETS_TO_BLANKS).split():
+            try:
+                numbers.append(float(word))
+            except ValueError:
+                others.append(word)
+        if numbers and others:
+            raise InputError(
+                f"{path}: line {number}, {key!r}, mixes numbers and words ({others[0][:60]!r}); "
+                "correct the number, or put a # before the line"
+            )
         if not all(map(math.isfinite, numbers)):
-            raise InputError(f"{path}: line {number}, {match[1]!r}, holds NaN or infinity")
+            raise InputError(f"{path}: line {number}, {key!r}, holds NaN or infinity")
         if numbers:
-            values[match[1]] = numbers
-    return values
+            numbers_of_key[key] = numbers
+    return numbers_of_key
 
 
 def parse_finite(text: str) -> float:

@@ -19,7 +19,7 @@ from depthpose.core.checkpoint import add_terms, list_misfits, read_torch_file
 from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
-from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
+from depthpose.core.files.disk import refuse_heavy_text, refused_as, refused_write
 from depthpose.core.loop.task import TrainingConfig, ValidationResult
 
 STATE = "state.pt"  # the last saved state of a training
@@ -122,7 +122,7 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         return []
     rows: list[dict[str, Any]] = []
     text = read_text(path)
-    refuse_heavy(path, text.encode(), _METRICS_SIGN_BYTES)
+    refuse_heavy_text(path, text.encode(), _METRICS_SIGN_BYTES)
     for number, line in enumerate(StringIO(text), 1):
         row = None
         with suppress(ValueError, RecursionError):

@@ -10,7 +10,7 @@ from depthpose.core import files
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import write_bytes
-from depthpose.core.run_folder import is_whole, note_result
+from depthpose.core.run_folder import is_result_finished, note_result
 from depthpose.depth.types import RawFrame
 
 _CALIBRATION_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
@@ -19,12 +19,12 @@ _CALIBRATION_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 def has_raw_frame(folder: Path, drive: str, number: int) -> bool:
     """Whether all files of a frame of :func:`write_raw_frame` exist as they were written."""
     last = f"{drive[:10]}/{drive}/disp_occ/{number:010d}.png"
-    return is_whole(folder, f"{drive}/{number:010d}", [last])
+    return is_result_finished(folder, f"{drive}/{number:010d}", [last])
 
 
 def has_calibration(folder: Path, date: str) -> bool:
     """Whether the calibration of a date exists as it was written."""
-    return is_whole(folder, date, [f"{date}/{name}" for name in _CALIBRATION_FILES])
+    return is_result_finished(folder, date, [f"{date}/{name}" for name in _CALIBRATION_FILES])
 
 
 def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> None:
@@ -70,7 +70,7 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
 
 def has_scene(folder: Path, name: str) -> bool:
     """Whether all files of a scene of :func:`write_scene` exist as they were written."""
-    return is_whole(folder, name, [f"{name}/disp0.pfm"])
+    return is_result_finished(folder, name, [f"{name}/disp0.pfm"])
 
 
 def write_scene(folder: Path, name: str, frame: RawFrame) -> None:

@@ -164,30 +164,32 @@ class Refinement(nn.Module):
             right_half: features of the right view at half size.
             least_px: in eval mode, the least disparity of the result.
         """
-        # The disparities of the four pixels that a pixel at half size is, and their mean, in pixels
-        # at half size.
+        # A pixel at half size covers four pixels at full size: their disparities, and the mean of
+        # these, in pixels at half size.
         four_px = F.pixel_unshuffle(enlarged_px.detach()[:, None], 2) / 2
         mean_px = four_px.mean(1)
 
         # The cosine of each group of features at five disparities about the mean.
-        compared_left = self.compared(left_half)
-        compared_right = self.compared(right_half)
-        left = unit_groups(compared_left.float(), _REFINEMENT_GROUPS)
-        right = unit_groups(compared_right.float(), _REFINEMENT_GROUPS)
+        left_features = self.compared(left_half)
+        right_features = self.compared(right_half)
+        left_groups = unit_groups(left_features.float(), _REFINEMENT_GROUPS)
+        right_groups = unit_groups(right_features.float(), _REFINEMENT_GROUPS)
+        right_channels = right_groups.flatten(1, 2)
         cosines: list[Tensor] = []
         for offset_px in _OFFSETS_PX:
-            shifted = _shift_right_view(right.flatten(1, 2), mean_px + offset_px)
-            shifted_groups = shifted.unflatten(1, left.shape[1:3])
-            cosines.append((left * shifted_groups).sum(2))
+            shifted = _shift_right_view(right_channels, mean_px + offset_px)
+            shifted_groups = shifted.unflatten(1, left_groups.shape[1:3])
+            cosines.append((left_groups * shifted_groups).sum(2))
 
+        # The correction of each of the four pixels.
         inputs = [*cosines, left_half.float(), four_px - mean_px[:, None]]
-        x = torch.cat(inputs, 1).to(compared_left)
+        x = torch.cat(inputs, 1).to(left_features)
         for layer in self.layers:
             x = F.relu(layer(x))
         correction_px = F.pixel_shuffle(self.correction(x).to(enlarged_px), 2)[:, 0]
-        # In eval mode, as a frozen part of a larger training, gradients pass on to the views.
         if self.training:
             return enlarged_px.detach() + correction_px
+        # Not detached: a frozen matcher in a larger training passes gradients on to its views.
         return (enlarged_px + correction_px).clamp_min(least_px)
 
 
@@ -235,20 +237,25 @@ class SkyHead(nn.Module):
     ) -> QuarterMaps:
         """Estimate the probability of the sky from features of the left view and from its match.
 
-        What is surely matched as near is no sky. No gradient reaches the matcher by the match.
+        The match helps, since what is surely matched as near is no sky. No gradient reaches the
+        matcher by it.
 
         Args:
             levels: features at 1/4, 1/8, 1/16 and 1/32 size.
             quarter_px: disparity at 1/4 size [px of the full size].
             confidence: confidence of this disparity, 0..1.
         """
-        quarter, *coarser = levels
-        context: list[Tensor] = []  # of the coarser levels; the coarsest one has none
-        for layer, level in zip(reversed(self.coarse), reversed(coarser), strict=True):
-            x = F.relu(layer(torch.cat([level, *context], 1)))
-            context = [F.interpolate(x, scale_factor=2.0, mode="nearest")]
+        # From the coarsest level to that at 1/8 size: each sees its features, and the enlarged
+        # output of the level before, if there is one.
+        quarter_features, *coarser = levels
+        from_coarser: list[Tensor] = []
+        for layer, features in zip(reversed(self.coarse), reversed(coarser), strict=True):
+            x = F.relu(layer(torch.cat([features, *from_coarser], 1)))
+            from_coarser = [F.interpolate(x, scale_factor=2.0, mode="nearest")]
+
+        # At 1/4 size, beside the match.
         match = torch.stack([confidence, quarter_px / _SKY_UNIT_PX], 1).detach()
-        x = torch.cat([quarter, *context, match.to(quarter)], 1)
+        x = torch.cat([quarter_features, *from_coarser, match.to(quarter_features)], 1)
         hidden = F.relu(self.hidden(x))
         return self.logit(hidden)[:, 0].to(confidence).sigmoid()
 

@@ -132,26 +132,30 @@ def _find_sure_pixels(match: Match) -> Mask:
 
 
 def _find_ends(
-    disparity_px: Map, counts_as_far: Mask, counts_as_near: Mask, scale: float
+    disparity_px: Map, is_eligible_far: Mask, is_eligible_near: Mask, scale: float
 ) -> tuple[float, float]:
     """Find the least and the largest disparity, without the outermost, which may be wrong.
 
-    Where too few pixels count, all do.
+    One pixel is sampled for each pixel of the narrow copy. If either mask has at most ``_TAIL`` of
+    the samples, both ends are taken over all samples.
 
     Args:
         disparity_px: disparities of the narrow copy, at the size of the images.
-        counts_as_far: pixels of which one may be the farthest.
-        counts_as_near: pixels of which one may be the nearest.
-        scale: of the copy; one sample is taken for each of its pixels.
+        is_eligible_far: pixels of which one may be the farthest.
+        is_eligible_near: pixels of which one may be the nearest.
+        scale: scale of the copy relative to the images (at most 1).
     """
     stride = max(1, round(1 / scale))
-    samples = (slice(None, None, stride), slice(None, None, stride))
-    sampled_px = disparity_px[samples]
-    far_px = sampled_px[counts_as_far[samples]].sort().values
-    near_px = sampled_px[counts_as_near[samples]].sort().values
+    every_stride = slice(None, None, stride)
+    sample_index = (every_stride, every_stride)
+    sampled_px = disparity_px[sample_index]
+    far_px = sampled_px[is_eligible_far[sample_index]].sort().values
+    near_px = sampled_px[is_eligible_near[sample_index]].sort().values
     tail = int(_TAIL * sampled_px.numel())
     if min(len(far_px), len(near_px)) <= tail:
-        far_px = near_px = sampled_px.flatten().sort().values
+        all_px = sampled_px.flatten().sort().values
+        far_px = all_px
+        near_px = all_px
     return float(far_px[tail]), float(near_px[-1 - tail])
 
 

@@ -17,6 +17,7 @@ from depthpose.core.camera.rectified import grey_from_rgb
 from depthpose.core.errors import InputError
 from depthpose.depth.config import NearConfig, StreetsConfig
 from depthpose.depth.synthetic.dataset import SyntheticFrame, render_scene
+from depthpose.depth.synthetic.materials import Appearance
 from depthpose.depth.synthetic.mesh import MeshBuilder, Values, rotation_about_y
 from depthpose.depth.synthetic.near_objects import (
     PLAIN_MATERIALS,
@@ -80,8 +81,8 @@ def make_near(config: NearConfig, index: int) -> NearScene:
     # The surfaces.
     metres_per_unit = _draw_true_scale(rng, near_m)
     kind = _KINDS[int(rng.integers(len(_KINDS)))]
-    half_view = (rig.width / focal_px / 2, rig.height / focal_px / 2)
-    scene_builder = _NearSceneBuilder(rng, near_m, half_view, config.plain_share)
+    tan_half_fov = (rig.width / focal_px / 2, rig.height / focal_px / 2)
+    scene_builder = _NearSceneBuilder(rng, near_m, tan_half_fov, config.plain_share)
     match kind:
         case "room":
             max_depth = min(_MAX_ROOM_DEPTH, _FARTHEST_M / (near_m * metres_per_unit))
@@ -224,7 +225,7 @@ class _NearSceneBuilder:
     Args:
         rng: the random numbers.
         near_m: least distance of an object.
-        half_view: tangents of half of the camera's horizontal and vertical angle of view.
+        tan_half_fov: tangents of half the camera's horizontal and vertical field of view.
         plain_share: share of the large surfaces with next to no texture.
 
     Attributes:
@@ -237,22 +238,31 @@ class _NearSceneBuilder:
         self,
         rng: np.random.Generator,
         near_m: float,
-        half_view: tuple[float, float],
+        tan_half_fov: tuple[float, float],
         plain_share: float,
     ) -> None:
         self.rng = rng
         self.near_m = near_m
-        self.half_view = half_view
+        self.tan_half_fov = tan_half_fov
         self.plain_share = plain_share
         self.builder = MeshBuilder(rng)
         self.last_backdrop_id = 0
         self.far_m = near_m
 
     def _add_sheet(self, corner: Values, along: Values, up: Values) -> None:
+        """Add a large rectangle of random appearance to the backdrop."""
+        self._place_sheet(corner, along, up, self._draw_sheet_appearance())
+
+    def _draw_sheet_appearance(self) -> Appearance:
+        """Draw the appearance of a large rectangle."""
+        texture_m = self.near_m * draw_log_uniform(self.rng, 0.3, 3)
+        return draw_near_appearance(self.rng, texture_m, self.plain_share)
+
+    def _place_sheet(
+        self, corner: Values, along: Values, up: Values, appearance: Appearance
+    ) -> None:
         """Add a large rectangle to the backdrop, which may be nearer than objects."""
         self.builder.begin_object()
-        texture_m = self.near_m * draw_log_uniform(self.rng, 0.3, 3)
-        appearance = draw_near_appearance(self.rng, texture_m, self.plain_share)
         if appearance.material in PLAIN_MATERIALS:  # one tile, so that nothing repeats
             length_m = float(np.linalg.norm(np.asarray(along, float)))
             appearance = appearance._replace(tile_m=length_m)
@@ -267,7 +277,7 @@ class _NearSceneBuilder:
         slope_x, slope_y = self.rng.normal(0, 0.45, 2)
         # z = far + slope_x x + slope_y y, which is far / (1 - slope_x u - slope_y v) on the ray
         # (u, v, 1): of the divisor's range in the view, the largest is that of the nearest point.
-        half_u, half_v = self.half_view
+        half_u, half_v = self.tan_half_fov
         smallest = 1 - abs(slope_x) * half_u - abs(slope_y) * half_v
         largest = 1 + abs(slope_x) * half_u + abs(slope_y) * half_v
         if smallest < 0.15:  # so slanted that the far end would be at infinity: take none
@@ -282,29 +292,31 @@ class _NearSceneBuilder:
         self.far_m = far_m
 
     def add_room(self, far_m: float) -> None:
-        """Add a floor and a back wall at ``far_m``; mostly two side walls and a ceiling too."""
+        """Add a floor and a back wall at ``far_m``; in 70 % of rooms side walls and a ceiling."""
         rng = self.rng
-        half_u, half_v = self.half_view
+        half_u, half_v = self.tan_half_fov
         # Floor, side walls and ceiling come into view at ``near_m`` or beyond.
         half_x = self.near_m * half_u * draw_log_uniform(rng, 1, 4)
         floor_y, ceiling_height = (
             self.near_m * half_v * draw_log_uniform(rng, 1, 4) for _ in range(2)
         )
-        width = [2 * half_x, 0, 0]
-        ahead = [0, 0, far_m]
-        self._add_sheet([-half_x, floor_y, 0], width, ahead)
-
+        floor_appearance = self._draw_sheet_appearance()
         is_closed = rng.random() < 0.7
+        if not is_closed:  # floor and back wall fill the view
+            half_x = max(half_x, 3 * far_m * half_u)
+        width = [2 * half_x, 0, 0]
+        depth_edge = [0, 0, far_m]
+        self._place_sheet([-half_x, floor_y, 0], width, depth_edge, floor_appearance)
+
+        wall_corner = [-half_x, floor_y, far_m]
         if is_closed:
             up = [0, -(floor_y + ceiling_height), 0]
-            self._add_sheet([-half_x, floor_y, far_m], width, up)
+            self._add_sheet(wall_corner, width, up)
             for x in (-half_x, half_x):
-                self._add_sheet([x, floor_y, 0], ahead, up)
-            self._add_sheet([-half_x, -ceiling_height, 0], width, ahead)
-        else:  # the back wall fills the view
-            wall_half_x = max(half_x, 3 * far_m * half_u)
-            across = [2 * wall_half_x, 0, 0]
-            self._add_sheet([-wall_half_x, floor_y, far_m], across, [0, -30 * far_m, 0])
+                self._add_sheet([x, floor_y, 0], depth_edge, up)
+            self._add_sheet([-half_x, -ceiling_height, 0], width, depth_edge)
+        else:
+            self._add_sheet(wall_corner, width, [0, -30 * far_m, 0])
         self.far_m = far_m
 
     def add_table(self, *, is_bin: bool) -> None:
@@ -316,7 +328,7 @@ class _NearSceneBuilder:
         table = self._draw_table_plane(max_tilt_deg=35 if is_bin else 75)
         half_side_m = table.distance_m * draw_log_uniform(rng, 0.5, 4)
         if is_bin:
-            half_side_m = table.distance_m * self.half_view[0] * rng.uniform(0.6, 1.2)
+            half_side_m = table.distance_m * self.tan_half_fov[0] * rng.uniform(0.6, 1.2)
         self.add_wall(table.distance_m * draw_log_uniform(rng, 1.3, 5))
         corner = table.middle - half_side_m * (table.right + table.ahead)
         self._add_sheet(corner, 2 * half_side_m * table.right, 2 * half_side_m * table.ahead)
@@ -343,7 +355,7 @@ class _NearSceneBuilder:
         # The plane passes through the axis so far away that its nearest visible corner is far
         # enough; a ray (u, v, 1) meets it at z = distance * normal_z / (normal . ray).
         rays = np.array([[u, v, 1.0] for u in (-1, 0, 1) for v in (-1, 0, 1)])
-        rays[:, :2] *= self.half_view
+        rays[:, :2] *= self.tan_half_fov
         aligned = rays @ normal
         meets_plane = aligned < -0.03  # and not very far away
         nearest_share = (normal[2] / aligned[meets_plane]).min()
@@ -364,7 +376,7 @@ class _NearSceneBuilder:
         """Add many objects of one kind and size, heaped up to the height of the bin."""
         rng = self.rng
         kind = draw_near_kind(rng)
-        size_m = table.distance_m * self.half_view[0] * draw_log_uniform(rng, 0.1, 0.5)
+        size_m = table.distance_m * self.tan_half_fov[0] * draw_log_uniform(rng, 0.1, 0.5)
         for _ in range(int(rng.integers(20, 70))):
             point = self._draw_point_on(table)
             if point is not None:
@@ -378,7 +390,7 @@ class _NearSceneBuilder:
         for _ in range(int(rng.integers(2, 30))):
             point = self._draw_point_on(table)
             if point is not None:
-                size_m = point[2] * self.half_view[0] * draw_log_uniform(rng, 0.08, 0.7)
+                size_m = point[2] * self.tan_half_fov[0] * draw_log_uniform(rng, 0.08, 0.7)
                 lift_m = rng.uniform(0.2, 0.6) * size_m
                 self._add_object(point + lift_m * table.normal, size_m)
 
@@ -387,7 +399,7 @@ class _NearSceneBuilder:
 
         None where the ray meets the plane very far away, or not at all.
         """
-        ray = np.array([*(self.rng.uniform(-1, 1, 2) * self.half_view), 1.0])
+        ray = np.array([*(self.rng.uniform(-1, 1, 2) * self.tan_half_fov), 1.0])
         normal_part = float(ray @ table.normal)
         if normal_part > -0.05:
             return None
@@ -402,7 +414,7 @@ class _NearSceneBuilder:
         self.add_wall(back_m * rng.uniform(1.0, 1.6))
 
         # Size, appearance and rotation of the shelf.
-        half_x, half_y = (back_m * side * rng.uniform(0.6, 1.5) for side in self.half_view)
+        half_x, half_y = (back_m * side * rng.uniform(0.6, 1.5) for side in self.tan_half_fov)
         thick_m = depth_m * rng.uniform(0.02, 0.12)
         appearance = draw_near_appearance(rng, half_x)
         rotation = rotation_about_y(rng.normal(0, 0.25))
@@ -435,8 +447,8 @@ class _NearSceneBuilder:
         rng = self.rng
         for _ in range(count):
             z = draw_log_uniform(rng, 1.05 * self.near_m, max(1.1 * self.near_m, self.far_m))
-            centre = np.array([*(rng.uniform(-1, 1, 2) * self.half_view * z), z])
-            size_m = z * self.half_view[0] * draw_log_uniform(rng, 0.06, 0.7)
+            centre = np.array([*(rng.uniform(-1, 1, 2) * self.tan_half_fov * z), z])
+            size_m = z * self.tan_half_fov[0] * draw_log_uniform(rng, 0.06, 0.7)
             self._add_object(centre, size_m)
 
     def _add_object(self, centre: np.ndarray, size_m: float, kind: str | None = None) -> None:

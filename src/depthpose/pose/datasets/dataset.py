@@ -493,6 +493,8 @@ def _describe_visible(shown: BopObject, frame: BopFrame) -> dict[str, Any]:
 def write_bop_models(folder: Path, models: Sequence[ObjectModel]) -> Path:
     """Write models in BOP's layout: ``models/obj_NNNNNN.ply`` in mm, and ``models_info.json``.
 
+    The geometry and the symmetries are written; colours, normals and keypoints are left out.
+
     Returns:
         The folder of the models.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from depthpose.core.camera.pinhole import check_intrinsics
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, read_text
-from depthpose.core.files.disk import parse_yaml, refuse_heavy
+from depthpose.core.files.disk import parse_yaml, refuse_heavy_text
 from depthpose.core.rigid import Rigid
 
 _ROTATION_SLACK = 1e-2  # published ones are rounded; LineMOD's are off by a few thousandths
@@ -39,7 +39,7 @@ def read_mapping(path: Path) -> dict[Any, Any]:
         content = read_json(path)
     else:
         text = read_text(path)
-        refuse_heavy(path, text.encode(), _YAML_BYTES)
+        refuse_heavy_text(path, text.encode(), _YAML_BYTES)
         content = parse_yaml(path, text)
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds a {type(content).__name__}, where names to values belong")

@@ -70,7 +70,7 @@ def read_labels(
             )
         runs = read_runs(entries[0], str(path))
         return decode_rle(*runs).long()
-    pixels = _read_pixels(path, with_palette=labels is None)
+    pixels = _read_pixels(path, apply_palette=labels is None)
 
     # Grey is a number already.
     values = pixels[..., 0]
@@ -98,27 +98,41 @@ def _number_colors(pixels: np.ndarray) -> np.ndarray:
     return place if has_black else place + 1
 
 
-def _read_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
-    """Read the pixels of a mask image as (h, w, channels).
+def _read_pixels(path: Path, *, apply_palette: bool) -> np.ndarray:
+    """Read the pixels of a mask image (h, w, channels), without loss of a bit.
 
-    There is one channel of numbers, or three of colours, or four with alpha. Of an image with a
-    palette the colours are read ``with_palette``, else their indices; with transparency always the
-    colours. A JPEG becomes black and white.
+    A grey image has one channel of numbers, a colour image three. One with transparency has four:
+    its colours, or its number three times, and alpha. A JPEG becomes black and white.
+
+    Args:
+        path: the image.
+        apply_palette: read the colours of an image with a palette, not its indices. If the palette
+            has a transparent colour, the colours are always read.
 
     Raises:
         InputError: the image cannot be read, or is a JPEG of more grey than white.
     """
     with open_image(path) as image:
-        # With alpha, indices of a palette, numbers, or colours.
-        if image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or "transparency" in image.info:
+        has_transparency = "transparency" in image.info  # a value, or alpha of a palette
+        if image.mode == "I" or image.mode.startswith("I;16"):
+            # Numbers of more than 8 bits, which Pillow's conversion to colours would clip.
+            numbers = np.asarray(image).astype(np.int32)
+            pixels = numbers[..., None]
+            if has_transparency:
+                alpha = np.where(numbers == image.info["transparency"], 0, 255)
+                pixels = np.stack([numbers, numbers, numbers, alpha], -1)
+        elif image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or has_transparency:
+            # Colours and alpha.
             pixels = np.asarray(image.convert("RGBA"))
-        elif not with_palette and image.mode == "P":
+        elif image.mode in ("1", "L") or (image.mode == "P" and not apply_palette):
+            # Numbers of up to 8 bits, or indices of a palette.
             pixels = np.asarray(image).astype(np.int32)[..., None]
         elif image.mode == "F":
-            pixels = object_numbers(torch.from_numpy(np.array(image)), str(path)).numpy()[..., None]
-        elif image.mode in ("1", "L", "I") or image.mode.startswith("I;16"):
-            pixels = np.asarray(image).astype(np.int32)[..., None]
+            # Numbers or probabilities, from a file of floats.
+            values = torch.from_numpy(np.array(image))
+            pixels = object_numbers(values, str(path)).numpy()[..., None]
         else:
+            # Colours, also those of a palette.
             pixels = np.asarray(image.convert("RGB"))
 
         # Compression of JPEG leaves grey pixels at edges, which are no object.

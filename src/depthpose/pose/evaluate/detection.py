@@ -23,8 +23,9 @@ MOST_ESTIMATES = 100  #: of one image that count: those of the highest scores of
 _LIMITS = {"mssd_m": BOP_SHARES, "mspd_px": BOP_PIXELS}  # in diameters, and in pixels
 _COLUMNS = {"mssd_m": "ap_mssd", "mspd_px": "ap_mspd"}
 _FAR_DIAMETERS = 1.0
-"""Distance of the centres of two poses beyond which MSSD is certainly above its largest limit, half
-a diameter."""
+"""Lower bound of MSSD, in diameters, beyond which it is not computed: twice its largest limit."""
+_CUBE_CORNERS = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+"""Corners (8, 3) of the cube of side 2 about the origin."""
 
 ErrorsOfPairs = Mapping[tuple[str, str], Mapping[str, Errors]]
 """Errors by their names, for each pair of an estimate and an instance, by the names of both."""
@@ -123,29 +124,45 @@ def _measure_errors(
         assert pose is not None
         for column, instance in enumerate(image.instances):
             errors = measured.get((prediction.estimate.name, instance.name), {})
-            for name, table in tables.items():
-                if name in errors:
-                    table[row, column] = float(errors[name])
-                elif not _is_certainly_far(name, pose, instance, context):
-                    table[row, column] = float(METRICS[name].measure(pose, instance, context))
+            for error, table in tables.items():
+                if error in errors:
+                    table[row, column] = float(errors[error])
+                elif not _is_certainly_far(error, pose, instance, context):
+                    table[row, column] = float(METRICS[error].measure(pose, instance, context))
     return tables
 
 
-def _is_certainly_far(name: str, pose: Rigid, instance: Instance, context: ErrorContext) -> bool:
+def _is_certainly_far(error: str, pose: Rigid, instance: Instance, context: ErrorContext) -> bool:
     """Whether an error is certainly beyond all its limits, by a bound that is fast to compute.
 
-    ``name`` is that of the error, ``mssd_m`` or ``mspd_px``.
+    Args:
+        error: ``mssd_m`` or ``mspd_px``.
+        pose: the estimate, ``camera_from_model``.
+        instance: with its true pose, of which each symmetric copy is compared.
+        context: the model and its symmetries.
     """
-    points_m = context.model.vertices_m.double()
-    estimated_m = pose.double().apply(points_m)
-    true_m = instance.camera_from_model.double().apply(points_m)
-    if name == "mssd_m":
-        distance_m = float((estimated_m.mean(0) - true_m.mean(0)).norm())
-        return distance_m > _FAR_DIAMETERS * context.model.diameter_m
+    vertices_m = context.model.vertices_m.double()
+    centroid_m = vertices_m.mean(0)
+    centroid_copies_m = context.symmetries.double().apply(centroid_m[None])[:, 0]
+    true_pose = instance.camera_from_model.double()
+    estimated_m = pose.double().apply(vertices_m)
 
-    # MSPD: no two points are nearer than the boxes about the points.
+    # MSSD is the largest distance of a vertex, so at least that of the centroid, at every copy.
+    if error == "mssd_m":
+        true_centroids_m = true_pose.apply(centroid_copies_m)
+        distance_m = float((true_centroids_m - estimated_m.mean(0)).norm(dim=-1).min())
+        return distance_m > _FAR_DIAMETERS * context.diameter_m
+
+    # All vertices at all copies lie in a ball about the true centroid, and so in the cube about it.
+    radius_m = (vertices_m - centroid_m).norm(dim=-1).max()
+    largest_shift_m = (centroid_copies_m - centroid_m).norm(dim=-1).max()
+    cube_corners_m = (
+        true_pose.apply(centroid_m[None]) + (radius_m + largest_shift_m) * _CUBE_CORNERS
+    )
+
+    # MSPD has a lower bound: the gap between the two projections' bounding boxes.
     estimated_px = project(estimated_m, instance.K)
-    true_px = project(true_m, instance.K)
+    true_px = project(cube_corners_m, instance.K)
     if not bool(estimated_px.isfinite().all() & true_px.isfinite().all()):
         return False  # a point lies behind the camera
     right_gap = estimated_px.amin(0) - true_px.amax(0)

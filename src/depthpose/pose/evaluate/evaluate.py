@@ -168,8 +168,9 @@ _COVERAGES = 10  # at which the risk is measured: tenths of all instances
 def summarise_instances(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
     """Summarise the instances of an object, or of all objects, in a row called ``name``.
 
-    ``success``, ``refused`` and ``wrong`` add up to 1: an instance without a pose is refused.
-    Medians are over the instances with a pose, all else over all instances.
+    ``coverage`` is the share of instances with a pose; those without one are ``refused``. So
+    ``success``, ``wrong`` and ``refused`` add up to 1. Medians are over the instances with a pose,
+    all else over all instances.
     """
     count = len(rows)
     success = sum(row.is_success for row in rows) / count

@@ -261,21 +261,35 @@ def _find_point_on_axis(
 ) -> Float64[Tensor, "3"]:
     """Find a point on an axis of some direction, such that the surface rotated about it fits best.
 
+    The axis is shifted from three starts, and the best of the three results is taken.
+
     Returns:
         The point (3,) in the model frame [m].
     """
-    step = max(1, len(turns.angles_rad) // _COMPARED_TURNS)
-    origin = -surface.centre_m / model.diameter_m  # of the file
-    best_deviation = math.inf
-    best_point = origin
-    for start in (torch.zeros(3).double(), surface.middle, origin):
-        point = _shift_axis(start, turns, surface)
-        rotations = turn_about(turns.direction, point, turns.angles_rad[::step])
-        deviation = float(surface.deviation(rotations.R, rotations.t_m).max())
-        if deviation < best_deviation:
-            best_deviation = deviation
-            best_point = point
+    # In the frame of ``surface``: about its centroid, in diameters.
+    centroid = torch.zeros(3).double()
+    middle_of_box = surface.middle
+    origin_of_file = -surface.centre_m / model.diameter_m
+    starts = (centroid, middle_of_box, origin_of_file)
+    points = [_shift_axis(start, turns, surface) for start in starts]
+    best_point = min(points, key=lambda point: _measure_axis(point, turns, surface))
+
+    # In the model frame, in metres.
     return best_point * model.diameter_m + surface.centre_m
+
+
+def _measure_axis(
+    point: Float64[Tensor, "3"], turns: DeclaredTurns, surface: SurfaceDeviation
+) -> float:
+    """Measure how far the surface rotated about an axis through a point lies off itself.
+
+    The point is about the centroid of the surface, and both lengths are in diameters. Some of the
+    rotations are compared, and the worst of them counts.
+    """
+    step = max(1, len(turns.angles_rad) // _COMPARED_TURNS)
+    rotations = turn_about(turns.direction, point, turns.angles_rad[::step])
+    shift = rotations.t_m  # in diameters, as the point is
+    return float(surface.deviation(rotations.R, shift).max())
 
 
 def _shift_axis(

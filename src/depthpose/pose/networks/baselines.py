@@ -88,8 +88,11 @@ def cut_depth(
     Args:
         view: depth image and mask of the object.
         config: size, margin and contrast of the crop.
-        diameter_m: of the object. Masked pixels whose depth differs by more from the median are
-            left out; None: all are kept.
+        diameter_m: of the object. Masked pixels whose depth differs by more than this from their
+            median depth are left out; None: all are kept.
+
+    Returns:
+        The crop. Pixels are taken to be square: its width is computed by fx.
 
     Raises:
         InputError: mask and depth differ in size.
@@ -111,20 +114,21 @@ def cut_depth(
     middle_px = (low_px + high_px) / 2
     side_px = config.margin * float((high_px - low_px).max())
     mean_m = depth_m[is_seen].mean()
-    relief = ((depth_m / mean_m - 1) / config.contrast).clamp(-1, 1)
-    relief = torch.where(is_seen, relief, EMPTY)
+    normalized_depth = ((depth_m / mean_m - 1) / config.contrast).clamp(-1, 1)
+    normalized_depth = torch.where(is_seen, normalized_depth, EMPTY)
 
     # Resized by nearest neighbour, so that depth is not mixed across edges.
     offsets = (torch.arange(config.crop_px) + 0.5) / config.crop_px - 0.5  # in sides of the crop
     column = (middle_px[0] + side_px * offsets).round().long()
     row = (middle_px[1] + side_px * offsets).round().long()
-    height, width = relief.shape
+    height, width = normalized_depth.shape
     is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
-    image = relief[row.clamp(0, height - 1)[:, None], column.clamp(0, width - 1)]
+    image = normalized_depth[row.clamp(0, height - 1)[:, None], column.clamp(0, width - 1)]
 
-    # The ray through the middle, toward which the crop's axes are turned.
+    # The ray through the middle, toward which the crop's axes are turned: K^-1 (u, v, 1).
     K = view.K.to(depth_m)
-    ray = torch.linalg.solve(K, torch.cat([middle_px, torch.ones(1)]))
+    pixel = torch.cat([middle_px, torch.ones(1)]).to(depth_m)
+    ray = torch.linalg.solve(K, pixel)
     return DepthCrop(
         image=torch.where(is_inside, image, EMPTY)[None],
         R=rotation_from_z_to(ray).to(ray),

@@ -95,7 +95,7 @@ _STAGES = (
 
 
 def propose_in_frame(
-    frame: Frame, is_unclaimed: Bool[Tensor, "h w"], table: PairTable, models: int = 1
+    frame: Frame, is_unclaimed: Bool[Tensor, "h w"], table: PairTable, model_count: int = 1
 ) -> tuple[Rigid, Float64[Tensor, " b"]]:
     """Propose poses of a model in an image: point pairs vote, the best are refined and scored.
 
@@ -103,22 +103,22 @@ def propose_in_frame(
         frame: the image.
         is_unclaimed: pixels that may vote: in the mask, and explained by no object found before.
         table: point pairs of the model.
-        models: number of models that are searched in the image.
+        model_count: number of models that are searched in the image, which share its time.
 
     Returns:
         Poses ``camera_from_model``, roughly refined, the best first, and the score of each
         (:func:`score_by_image`).
     """
-    # Votes.
+    # A random sample of the scene's points votes, the first of them as reference points.
     surface = table.surface
     points_m, normals = _average_scene_points(frame, is_unclaimed, surface)
     generator = torch.Generator().manual_seed(_ORDER_SEED)
-    order = torch.randperm(len(points_m), generator=generator)[:_MOST_POINTS]
-    references = torch.arange(_choose_number_of_references(len(order), models))
-    poses, score = vote_poses(points_m[order], normals[order], references, table, _PEAKS)
+    sample = torch.randperm(len(points_m), generator=generator)[:_MOST_POINTS]
+    references = torch.arange(_choose_number_of_references(len(sample), model_count))
+    poses, score = vote_poses(points_m[sample], normals[sample], references, table, _PEAKS)
 
-    # Fewer and fewer poses are refined and compared, more and more closely. Their scores take the
-    # place of the votes, by which none is chosen.
+    # Fewer and fewer poses are refined and compared, more and more closely. The number of votes is
+    # not compared: the first stage replaces it by a score.
     for stage in _STAGES:
         poses = refine_projectively(frame, poses, surface, stage)
         score = score_by_image(frame, poses, surface, stage)
@@ -129,16 +129,13 @@ def propose_in_frame(
     return poses[is_good], score[is_good]
 
 
-def _choose_number_of_references(points: int, models: int) -> int:
-    """Choose how many of a scene's points vote with each of the others, in a search of models.
-
-    ``points`` and ``models`` are their numbers.
-    """
-    if points < _LEAST_POINTS:
+def _choose_number_of_references(point_count: int, model_count: int) -> int:
+    """Choose how many of a scene's points vote with each of the others, in a search of models."""
+    if point_count < _LEAST_POINTS:
         return 0
-    wanted = max(_WANTED_REFERENCES, points // _REFERENCE_EVERY)
-    most = min(_MOST_REFERENCES, _MOST_REFERENCES_OF_ALL // models)
-    return min(points, max(_FEWEST_REFERENCES, min(wanted, most)))
+    wanted = max(_WANTED_REFERENCES, point_count // _REFERENCE_EVERY)
+    most = min(_MOST_REFERENCES, _MOST_REFERENCES_OF_ALL // model_count)
+    return min(point_count, max(_FEWEST_REFERENCES, min(wanted, most)))
 
 
 def _average_scene_points(

@@ -70,12 +70,12 @@ class PairTable:
 
 
 def prepare_pairs(surface: Surface) -> PairTable:
-    """Make the table of a surface's point pairs, sorted by their features, for many clouds.
+    """Make the table of a surface's point pairs, once for the search in many clouds.
 
     Args:
         surface: of the model; normals may point to either side.
     """
-    # Points of the visible surface, few enough.
+    # Points of the visible surface, thinned until there are few enough.
     points_m, normals = _find_points_seen_from_afar(surface)
     step_m = STEP * surface.diameter_m
     chosen = thin_cloud(points_m, normals, step_m)
@@ -85,26 +85,31 @@ def prepare_pairs(surface: Surface) -> PairTable:
     points_m = points_m[chosen]
     bases = _make_bases(normals[chosen])
 
-    # All pairs of two different points, by feature. Within a feature they are shuffled, so that the
-    # first ones are a sample of all.
+    # All pairs of two different points, in the order of their first points: the number of each
+    # pair's feature, and its angle.
     count = len(points_m)
-    first = torch.arange(count).repeat_interleave(count - 1)
+    first_point = torch.arange(count).repeat_interleave(count - 1)
     bin_m = STEP * surface.diameter_m
-    key_of_pair, turn_of_pair = describe_all_pairs(array_of(points_m), array_of(bases), bin_m)
+    feature_array, turn_array = describe_all_pairs(array_of(points_m), array_of(bases), bin_m)
+    feature = torch.from_numpy(feature_array)
+    turn = torch.from_numpy(turn_array)
+
+    # Sorted by feature. They are shuffled before, so that the first pairs of a feature are a random
+    # sample of all of its pairs.
     generator = torch.Generator().manual_seed(_SHUFFLE_SEED)
-    shuffle = torch.randperm(len(first), generator=generator)
-    sorted_keys, place = torch.from_numpy(key_of_pair)[shuffle].sort(stable=True)
-    order = shuffle[place]
+    shuffle = torch.randperm(len(first_point), generator=generator)
+    sorted_feature, sorting = feature[shuffle].sort(stable=True)
+    order = shuffle[sorting]
 
     # Where the pairs of each feature begin.
-    sizes = torch.bincount(sorted_keys, minlength=FEATURES)
+    sizes = torch.bincount(sorted_feature, minlength=FEATURES)
     bounds = torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
     return PairTable(
         points_m=points_m,
         bases=bases,
         bounds=bounds.int(),
-        first=first[order].int(),
-        turn=torch.from_numpy(turn_of_pair)[order].float(),
+        first=first_point[order].int(),
+        turn=turn[order].float(),
         surface=surface,
     )
 

@@ -174,24 +174,29 @@ def make_frames(
 ) -> Iterator[BopFrame]:
     """Make frames of several objects on a table, one after the other, for a dataset of BOP.
 
-    Frame i depends on the seed and i alone. A frame shows each object once at most, or a pile of
-    one of them (``frame_pile``). Poses are exact; the depth has a sensor's errors.
+    A frame depends on the seed and its number alone. It shows each object at most once, or if
+    ``config.frame_pile`` is set a pile of a single object. Poses are exact; the depth has a
+    sensor's errors.
 
     Args:
         models: of the objects; their numbers become ``obj_id``.
         config: of the frames.
         number: how many frames are made.
-        first: number of the first one.
+        first: number of the first frame.
 
     Raises:
-        InputError: no model, two of one number, or a camera that would be inside an object.
+        InputError: no model, two of one number, or a least distance of the camera below two
+            diameters of the largest object.
     """
     if not models:
         raise InputError("there is no object to show; give one model at least")
     numbers = [model.number for model in models]
-    twice = sorted({n for n in numbers if numbers.count(n) > 1})
-    if twice:
-        raise InputError(f"two models have the number {twice[0]}; it is their name in the frames")
+    repeated = sorted({number for number in numbers if numbers.count(number) > 1})
+    if repeated:
+        raise InputError(
+            f"two models have the number {repeated[0]}, by which frames name an object; give each "
+            "a number of its own"
+        )
     widest_m = max(model.diameter_m for model in models)
     if config.distance_m[0] < 2 * widest_m:
         raise InputError(

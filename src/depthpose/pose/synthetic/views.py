@@ -1,9 +1,10 @@
 """Synthetic views of known objects, by index.
 
-A view is rendered at a pose, or turned out of a view that was rendered before. A camera that turns
-about its own centre sees the same surface points, along other rays. A stored view is therefore a
-view from every direction of gaze, and only its pixels are interpolated: inverse depth, which is
-linear in the picture of a plane, so that flat parts stay exact. Depth is NaN where nothing is seen.
+A view is rendered at a pose, or resampled from a stored view by rotating the camera about its
+centre. The rotated camera sees the same surface points along other rays, so that a stored view
+serves every direction of the optical axis, and only its pixels are interpolated: inverse depth,
+which is linear in the picture of a plane, so that flat parts stay exact. Depth is NaN where nothing
+is seen.
 """
 
 import math
@@ -133,7 +134,7 @@ def render_view(shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]) -> CleanView
 def turn_view(
     view: CleanView, turn: Float[Tensor, "3 3"], shape: Shape, K: Float[Tensor, "3 3"]
 ) -> CleanView:
-    """Resample a view as a rotated camera sees it: ``x_new = turn @ x_old``.
+    """Resample a view as a camera rotated about its centre sees it: ``x_new = turn @ x_old``.
 
     Args:
         view: the view.
@@ -165,7 +166,8 @@ def _interpolate_inverse_depth(
 ) -> Float[Tensor, "rows columns"]:
     """Interpolate 1 / depth at places (u, v) between pixels; NaN outside of the image.
 
-    At edges and beside the object it is that of the nearest pixel.
+    At depth discontinuities, and next to pixels without depth, it is the nearest neighbour's value.
+    Within half a pixel beyond the outermost pixel centres it is extrapolated.
     """
     # The four pixels about each place.
     height, width = depth_m.shape
@@ -189,7 +191,7 @@ def _interpolate_inverse_depth(
     lowest = torch.minimum(torch.minimum(nw, ne), torch.minimum(sw, se))
     interpolated = torch.where(highest - lowest < JUMP * smooth, smooth, nearest)
 
-    # Half a pixel beyond the outermost ones the image ends.
+    # The image ends half a pixel beyond the centres of its outermost pixels.
     is_inside = (x - 0.5).abs().maximum((y - 0.5).abs()) <= 1
     return torch.where(is_inside, interpolated, torch.nan)
 
@@ -247,7 +249,7 @@ class SyntheticViews:
                     f"{1.5 * model.diameter_m:.2g} or farther, or correct the unit of the model."
                 )
         self._shapes = [make_shape(model) for model in self.models]
-        self._stored: dict[tuple[int, int], _StoredView] = {}  # by number of object and of view
+        self._stored: dict[tuple[int, int], _StoredView] = {}  # by index of object and of view
 
     def __len__(self) -> int:
         return self.config.number
@@ -266,9 +268,9 @@ class SyntheticViews:
     def render_stored(self, workers: int) -> None:
         """Render all stored views now, in ``workers`` threads, for processes forked later."""
         keys = [
-            (number, place)
-            for place in range(self.config.views or 0)
-            for number in range(len(self.models))
+            (object_index, view_index)
+            for view_index in range(self.config.views or 0)
+            for object_index in range(len(self.models))
         ]
         with ThreadPoolExecutor(workers) as pool:
             for _ in pool.map(lambda key: self._find_stored(*key), keys):
@@ -277,16 +279,16 @@ class SyntheticViews:
     def view(self, index: int) -> ViewSample:
         """Make the depth window and the mask that a sample is lifted from, and the true pose."""
         # The object alone.
-        number = index % len(self.models)
+        object_index = index % len(self.models)
         generator = make_sample_generator(index, self.config.seed)
-        clean = self._make_clean_view(number, generator)
+        clean = self._make_clean_view(object_index, generator)
         silhouette = clean.depth_m.isfinite()
         depth_m = clean.depth_m
         visible = silhouette
 
         # A background behind the object, and something that occludes a part of it.
         if self.config.with_background:
-            depth_m = self._add_background(clean, self._shapes[number], generator)
+            depth_m = self._add_background(clean, self._shapes[object_index], generator)
         if uniform(generator, 0.0, 1.0) < self.config.occluded_share:
             share = uniform(generator, *self.config.occlusion)
             depth_m, visible = occlude(depth_m, silhouette, share, generator)
@@ -301,7 +303,7 @@ class SyntheticViews:
         right = round(_draw_offset(generator, self.config.mask_shift_px) * scale)
         mask = _shift_mask(mask, down, right)
 
-        model = self.models[number]
+        model = self.models[object_index]
         view = ViewInput(
             name=f"{model.name}_{self.config.seed}_{index:06d}",
             depth_m=measured_m,
@@ -315,34 +317,38 @@ class SyntheticViews:
         )
         return ViewSample(input=view, truth=truth)
 
-    def _make_clean_view(self, number: int, generator: torch.Generator) -> CleanView:
-        """Make a view of an object without errors: rendered anew, or turned from a stored one."""
-        shape = self._shapes[number]
-        views = self.config.views
-        if views is not None:
-            stored = self._find_stored(number, random_index(generator, views))
-            K = self.make_intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
-            turn = self._draw_gaze(number, stored.distance_m, K, generator)
+    def _make_clean_view(self, object_index: int, generator: torch.Generator) -> CleanView:
+        """Make a view of an object without errors.
+
+        It is rendered anew, or a stored one is rotated about the camera centre.
+        """
+        shape = self._shapes[object_index]
+        stored_views = self.config.views
+        if stored_views is not None:
+            stored = self._find_stored(object_index, random_index(generator, stored_views))
+            resolution = float(stored.K[0, 0]) / self.config.focal_px[0]
+            K = self.make_intrinsics(resolution)
+            turn = self._draw_camera_rotation(object_index, stored.distance_m, K, generator)
             return turn_view(stored.restore(), turn, shape, K)
 
-        # Rendered anew: the object on the optical axis, turned with the camera to another place in
-        # the image. Its middle, (0, 0, distance), is turned too.
+        # Rendered anew: the object on the optical axis is rotated about the camera centre to
+        # another place in the image, and so is its middle, (0, 0, distance).
         R = random_rotation(generator)
         distance_m = uniform(generator, *self.config.distance_m)
         K = self.make_intrinsics(uniform(generator, *self.config.resolution))
-        turn = self._draw_gaze(number, distance_m, K, generator)
+        turn = self._draw_camera_rotation(object_index, distance_m, K, generator)
         R = turn @ R
         middle_m = turn[:, 2] * distance_m
         return render_view(shape, Rigid(R, middle_m - R @ shape.middle_m), K)
 
-    def _find_stored(self, number: int, place: int) -> _StoredView:
-        """Find stored view ``place`` of object ``number``; it is rendered when first needed."""
-        key = (number, place)
+    def _find_stored(self, object_index: int, view_index: int) -> _StoredView:
+        """Find a stored view of an object; it is rendered when first needed."""
+        key = (object_index, view_index)
         if key not in self._stored:
             # On the optical axis.
-            index = place * len(self.models) + number
+            index = view_index * len(self.models) + object_index
             generator = make_sample_generator(index, self.config.seed + _STORED_SEED)
-            shape = self._shapes[number]
+            shape = self._shapes[object_index]
             R = random_rotation(generator)
             distance_m = uniform(generator, *self.config.distance_m)
             K = self.make_intrinsics(uniform(generator, *self.config.resolution))
@@ -368,19 +374,19 @@ class SyntheticViews:
         ]
         return torch.tensor([*rows, [0, 0, 1]], dtype=torch.float64)
 
-    def _draw_gaze(
-        self, number: int, distance_m: float, K: Tensor, generator: torch.Generator
+    def _draw_camera_rotation(
+        self, object_index: int, distance_m: float, K: Tensor, generator: torch.Generator
     ) -> Float[Tensor, "3 3"]:
         """Draw a rotation of the camera by which an object lies wholly in the image, anywhere.
 
         Args:
-            number: of the object.
+            object_index: of the object.
             distance_m: of its middle.
             K: intrinsic matrix of the image.
             generator: of random numbers.
         """
         # The radius of the object in the image, by its nearest point.
-        radius_m = 0.5 * self.models[number].diameter_m
+        radius_m = 0.5 * self.models[object_index].diameter_m
         nearest_m = max(distance_m - radius_m, _NEAREST_M)
         radius_px = float(K[0, 0]) * radius_m / nearest_m
 
