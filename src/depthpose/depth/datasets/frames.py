@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -103,8 +103,8 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     Args:
         path: the file.
         name: name of the pair.
-        width: width of the images [px], for a file with one calibration for all pairs.
-        height: height of the images [px], likewise.
+        width: width of the images [px].
+        height: height of the images [px].
 
     Raises:
         InputError: there is no calibration of the pair, several, or one that is damaged.
@@ -114,14 +114,20 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         keys = files.read_key_values(path)
         return _make_rig(path, facts_from_lines(path, keys), (width, height))
 
-    # The line of the pair; other pairs' names may begin with this one's, and a space.
+    # The line of the pair; other pairs' names may begin with this one's, and a space. Such a name
+    # may go on with numbers, which would be another image size.
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
-    calibrations = [numbers for line in lines if len(numbers := _parse_leading_numbers(line)) >= 6]
+    numbers_of_lines = [_parse_leading_numbers(line) for line in lines]
+    calibrations = [numbers for numbers in numbers_of_lines if len(numbers) in (6, 8)]
     if lines and not calibrations:
         raise InputError(
             f"{path}: the line of {name!r} is no calibration: {lines[0][:80]!r} does not begin "
-            "with six numbers, width height focal_px cx cy baseline_m"
+            "with six numbers, width height focal_px cx cy baseline_m, or with eight, which go on "
+            "with focal_y_px cx_right_minus_left_px"
         )
+    if len(calibrations) > 1:
+        of_image_size = [numbers for numbers in calibrations if numbers[:2] == [width, height]]
+        calibrations = of_image_size or calibrations
     if len(calibrations) > 1:
         raise InputError(f"{path}: {len(calibrations)} lines for {name!r}. Keep one of them.")
     if not calibrations:
@@ -129,7 +135,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
             f"{path}: neither 'focal_px: ...' nor a line '{name} width height focal_px cx cy "
             "baseline_m'. Write focal_px, cx, cy and baseline_m, a line each."
         )
-    numbers = calibrations[0] if len(calibrations[0]) == 8 else calibrations[0][:6]
+    (numbers,) = calibrations
     columns = ("focal_px", "cx", "cy", "baseline_m", "focal_y_px", "cx_right_minus_left_px")
     values = {column: [number] for column, number in zip(columns, numbers[2:], strict=False)}
     try:
@@ -275,6 +281,7 @@ def project_lidar(
 CalibrationStyle = Literal["raw", "object", "grey", "middlebury", "plain", "camera"]
 """Format of a frame's calibration: KITTI's raw, object, or object of the grey pair; Middlebury's;
 ``calib.txt`` of a plain folder; or a camera file."""
+CALIBRATION_STYLES: tuple[CalibrationStyle, ...] = get_args(CalibrationStyle)
 
 
 @dataclass(frozen=True, kw_only=True)
