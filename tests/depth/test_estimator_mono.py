@@ -36,6 +36,7 @@ from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.evaluate import measure_image_confidence
 from depthpose.depth.generators import SelectionGenerator, UNetGenerator
+from depthpose.depth.mount import MountFilter
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher, SearchRange
 from depthpose.depth.synthesis import make_synthesiser
 from depthpose.depth.types import DepthEstimate, DepthInput, Match
@@ -488,6 +489,23 @@ def test_what_the_pipeline_cannot_take_is_one_clear_line(
 ) -> None:
     with pytest.raises(InputError, match=f"^pipeline: {re.escape(said)}"):
         depthpose.pipeline("depth-estimation", **options)
+
+
+@pytest.mark.parametrize("batch_size", [0, -1])
+def test_a_batch_of_no_picture_is_refused(batch_size: int, generator: UNetGenerator) -> None:
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
+    said = f"pipeline: batch_size is {batch_size}; take 1 or more pictures"
+    with pytest.raises(InputError, match=said):
+        DepthPipeline(net, batch_size)
+    for pictures in (RGB, [RGB]):
+        with pytest.raises(InputError, match=said):
+            DepthPipeline(net)(pictures, focal_px=100.0, batch_size=batch_size)
+
+
+def test_the_mount_of_a_pair_is_refused(generator: UNetGenerator) -> None:
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator), with_check=False)
+    with pytest.raises(InputError, match="a pair has metres of its own; omit mount, or the right"):
+        net.estimate(RGB, camera(60, 40, 100.0, 0.2), right=RGB, mount=MountFilter())
 
 
 def test_options_of_transformers_that_change_nothing_are_taken() -> None:

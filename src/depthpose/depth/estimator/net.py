@@ -285,8 +285,8 @@ class FakestereoNet:
             fov_deg: the horizontal field of view alone [degrees], in place of both.
             right: right image, the same size and rows.
             known_distance: column, row [px] and camera z [m] of a measured point, which sets the
-                scale of one image.
-            mount: the same for all frames of one camera on one vehicle, taken in order: holds its
+                scale of one image, not of a pair.
+            mount: of one image, the same for all frames of one camera on one vehicle, taken in order: holds its
                 height and smooths its tilt.
             name: name of the input in errors; by default that of the file.
 
@@ -471,9 +471,15 @@ class FakestereoNet:
         """Correct the depth of a single image by the mount of its camera; a pair stays as it is.
 
         Raises:
-            InputError: the camera states a mount that the image contradicts.
+            InputError: the camera states a mount that the image contradicts, or a pair is one of
+                the frames of a mount.
         """
         if estimate.input.right is not None:
+            if mount is not None:
+                raise InputError(
+                    f"{estimate.input.name}: a pair has metres of its own; omit mount, or the "
+                    "right image"
+                )
             return estimate
         synthesiser = self._require_synthesiser(estimate.input.name)
         return scale_by_mount(estimate, mount, synthesiser.config)
