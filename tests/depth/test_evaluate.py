@@ -182,6 +182,28 @@ def test_negative_depth_is_refused(alone: Dataset, tmp_path: Path) -> None:
         evaluate(alone, tmp_path, "eigen-raw-camera")
 
 
+def test_a_notice_is_given_once_for_each_evaluation(pairs: Dataset, tmp_path: Path) -> None:
+    far = write_predictions(tmp_path / "far", lambda px: px / 6)
+    squeezed = tmp_path / "squeezed"
+    for k, name in enumerate("abc"):
+        squeezed_px = resize_map(truth_px(k), H, W // 2) / 2
+        write_map(squeezed / f"{name}.disparity_px.npy", squeezed_px)
+    for folder, said in ((far, "is it without a scale"), (squeezed, "of another aspect")):
+        for _ in range(2):
+            with pytest.warns(Notice, match=said) as notices:
+                evaluate(pairs, folder, "kitti-2015")
+            assert len(notices) == 1
+            read_frame_result(pairs, 0, folder, "kitti-2015", None)
+
+
+def test_truth_of_both_views_has_the_size_of_the_image(pairs: Dataset, tmp_path: Path) -> None:
+    write_depth_png(tmp_path / "noc.png", torch.full((H, W + 2), 3.0))
+    frame = replace(pairs.frames[0], disparity_noc=tmp_path / "noc.png")
+    folder = write_predictions(tmp_path / "p", lambda px: px)
+    with pytest.raises(InputError, match=rf"noc\.png: is {W + 2}x{H}, but its left image is {W}x"):
+        evaluate(replace(pairs, frames=[frame]), folder, "kitti-2015")
+
+
 def test_what_a_poor_estimate_could_be_too_is_a_notice() -> None:
     true_px = 2 + torch.rand(40, 50)
     for factor, said in (

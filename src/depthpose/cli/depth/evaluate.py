@@ -407,6 +407,7 @@ def measure_shards(
     settings = read_settings(predictions)
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
     measured: dict[str, list[FrameMetrics] | str] = {}
+    given_notices: set[str] = set()  # each once for all frames
     for shard in tqdm(engine.read_records(predictions), name, disable=None, unit=" shards"):
         for frame, files in engine.read_shard(predictions, shard):
             if frame not in index_of:
@@ -417,7 +418,7 @@ def measure_shards(
                     path.parent.mkdir(parents=True, exist_ok=True)
                     path.write_bytes(content)
                 measured[frame] = measure_frame(
-                    dataset, index_of[frame], Path(folder), protocol, caps_m
+                    dataset, index_of[frame], Path(folder), protocol, caps_m, given_notices
                 )
 
     # Frames without a prediction: those without truth are skipped, others are an error.
