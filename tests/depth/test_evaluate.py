@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from depthpose.cli.depth.evaluate import measure_and_report
 from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import write_depth_png, write_image, write_map
@@ -194,6 +195,20 @@ def test_a_notice_is_given_once_for_each_evaluation(pairs: Dataset, tmp_path: Pa
                 evaluate(pairs, folder, "kitti-2015")
             assert len(notices) == 1
             read_frame_result(pairs, 0, folder, "kitti-2015", None)
+
+
+@pytest.mark.parametrize(("protocol", "count"), [("eigen-improved", 1), ("eigen-raw-camera", 0)])
+def test_depth_of_a_plain_folder_is_not_taken_for_annotated(
+    pairs: Dataset,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    protocol: str,
+    count: int,
+) -> None:
+    folder = write_predictions(tmp_path / "p", lambda px: px)
+    measure_and_report(pairs, [folder], protocol, (80.0,), tmp_path / "out", [])
+    said = "the truth of 2 frames is lidar_depth/ of a folder of pairs: compare no numbers"
+    assert capsys.readouterr().err.count(said) == count
 
 
 def test_truth_of_both_views_has_the_size_of_the_image(pairs: Dataset, tmp_path: Path) -> None:
