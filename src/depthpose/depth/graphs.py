@@ -297,7 +297,11 @@ _MAPS_SHAPE = ("batch", "height", "width")
 
 
 def image_graph(weights: DepthWeights) -> Graph:
-    """Make the graph of depth from one image: ``FakestereoNet.estimate`` without a right view.
+    """Make the graph of depth from one image: the networks of ``FakestereoNet.estimate``.
+
+    Left out is what follows them there: the correction by the mount of the camera, no depth and no
+    confidence in blank borders, the removal of skies that are too small to be one, and the weight
+    of the texture in the confidence of the sky.
 
     Inputs are ``image`` (batch, 3, height, width; RGB in [0, 1]) and ``K`` (3, 3; float64, of all
     images). Outputs are ``depth_m``, ``disparity_px`` (of the imitated rig, in the image's pixels),
@@ -354,7 +358,12 @@ def image_graph(weights: DepthWeights) -> Graph:
 
 
 def pair_graph(weights: DepthWeights) -> Graph:
-    """Make the graph of disparity of a rectified pair: ``FakestereoNet.estimate`` with ``right=``.
+    """Make the graph of disparity of a rectified pair, as ``match_in_usual_range`` computes it.
+
+    Of ``FakestereoNet.estimate`` with ``right=`` are left out: the check that it is a pair, the
+    measured range of the disparities with the doubts of hidden places and of what lies beyond, the
+    shift of the principal points, no disparity and no confidence in blank borders, the removal of
+    skies that are too small to be one, and the weight of the texture in the confidence.
 
     Inputs are ``left`` and ``right`` (batch, 3, height, width; RGB in [0, 1]), and ``K`` (3, 3;
     float64) where the weights were trained at one focal length. Outputs are ``disparity_px`` and
