@@ -24,6 +24,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.metrics import measure
 from depthpose.depth.predictions import CLOUD_M, OutputOptions, write_estimate
 from depthpose.depth.protocols import clamped_depth_from_disparity
+from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthError, DepthEstimate, DepthInput, DepthSample, DepthTruth
 from depthpose.pose.config import ObjectsConfig
@@ -142,7 +143,7 @@ def _choose_methods(network: FakestereoNet, sample: DepthSample) -> list[_DepthM
     nearest_px = width * _MAX_DISPARITY_SHARE + max(rig.cx_right_minus_left_px, 0.0)
     num_disparities = _SGBM_STEP_PX * math.ceil(nearest_px / _SGBM_STEP_PX)
     config = SGBMConfig(num_disparities=num_disparities, with_filled_holes=True)
-    sgbm = FakestereoNet.load(matcher="sgbm", config=config, with_check=False)
+    sgbm = FakestereoNet(SGBMMatcher(config), with_check=False)
     methods.append(_DepthMethod("SGBM, holes filled", _FROM_PAIR, sgbm))
 
     if sample.input.name == "street":

@@ -279,7 +279,7 @@ def test_a_name_that_begins_with_another_and_numbers_keeps_its_own_line(
 
 def test_a_line_of_seven_numbers_is_refused(tmp_path: Path) -> None:
     write(tmp_path / "calib.txt", f"a {W} {H} 700 10 6 0.5 710\n")
-    with pytest.raises(InputError, match="'a' is no calibration: .* or with eight, which go on"):
+    with pytest.raises(InputError, match=r"'a' is no calibration: .* or with eight, which go on"):
         read_plain_calibration(tmp_path / "calib.txt", "a", W, H)
 
 

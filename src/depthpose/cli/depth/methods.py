@@ -42,7 +42,7 @@ class SGBMSpec:
         """Build the matcher, with the settings of our tables."""
         config = SGBMConfig(with_filled_holes=self.with_filled_holes)
         name = "sgbm-filled" if self.with_filled_holes else "sgbm"
-        net = FakestereoNet.load(matcher="sgbm", config=config, with_check=self.with_check)
+        net = FakestereoNet(SGBMMatcher(config), with_check=self.with_check)
         return DepthMethod(name, net, {"matcher": "sgbm", **asdict(config)})
 
     def with_packed_weights(self) -> "SGBMSpec":
