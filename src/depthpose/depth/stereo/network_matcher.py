@@ -326,10 +326,9 @@ def lower_where_disagreeing(
         tolerance_px: a difference up to this counts as none.
         decay_px: difference beyond the tolerance at which the agreement falls to 1/e.
     """
-    # Disparities at the matching points: NaN outside the right view.
-    matched_px = disparity.warp_right_to_left(right_px[None], match.disparity_px)[0]
-    difference_px = ((match.disparity_px - matched_px).abs() - tolerance_px).clamp(min=0)
-    agreement = torch.exp(-difference_px / decay_px).nan_to_num(0.0)
+    difference_px = disparity.left_right_difference(match.disparity_px, right_px)
+    beyond_px = (difference_px - tolerance_px).clamp(min=0)
+    agreement = torch.exp(-beyond_px / decay_px).nan_to_num(0.0)  # NaN outside the right view
     if match.confidence is None:
         return replace(match, confidence=agreement)
     confidence = match.confidence * (1 + agreement) / 2

@@ -1,7 +1,7 @@
 """Settings of the stages; the defaults of the thesis's three are its schedules (2.4.2, 2.5.3)."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError, refuse_unknown
@@ -9,6 +9,7 @@ from depthpose.core.loop import AdamConfig, LoopConfig, TrainingConfig
 from depthpose.depth.config import (
     DegradeConfig,
     GeneratorConfig,
+    NetworkConfig,
     PairsConfig,
     SelectionConfig,
 )
@@ -211,7 +212,7 @@ class StereoTraining(TrainingConfig):
 
     def _refuse_unlearnt_sky(self) -> None:
         """Refuse a class of the sky without weight, and training one that is not there."""
-        has_sky = bool(getattr(self.network_config, "with_sky", False))
+        has_sky = self.network_config.with_sky
         if has_sky and self.sky_weight == 0:
             raise InputError(
                 "with_sky is true and sky_weight 0, so the sky would not be learnt; set sky_weight "
@@ -224,8 +225,8 @@ class StereoTraining(TrainingConfig):
             )
 
     @property
-    def network_config(self) -> Any:  # noqa: ANN401  the config of its kind
-        """Config of the network that is trained, a :class:`NetworkConfig` of its kind."""
+    def network_config(self) -> NetworkConfig:
+        """Config of the network that is trained, of its kind."""
         return config_from_dict(self.network, MATCHERS[self.kind].config, source="network")
 
 
