@@ -146,7 +146,13 @@ class NetworkMatcher(ABC):
 
     @torch.no_grad()
     def match_within(
-        self, left: Tensor, right: Tensor, search: SearchRange, camera: Camera | None = None
+        self,
+        left: Tensor,
+        right: Tensor,
+        search: SearchRange,
+        camera: Camera | None = None,
+        *,
+        with_left_right_check: bool = False,
     ) -> Match:
         """Match one pair at the size and within the disparities of a search.
 
@@ -155,6 +161,8 @@ class NetworkMatcher(ABC):
             right: right image, the same size.
             search: size and disparities.
             camera: camera of the left image; with one, pixels become square.
+            with_left_right_check: match the mirrored pair too, and lower the confidence where both
+                disagree.
 
         Returns:
             The match, at the size and on the device of ``left``.
@@ -170,7 +178,7 @@ class NetworkMatcher(ABC):
             for view in (left, right)
         )
         match = self._match_padded(left_view, right_view, search)
-        if self.config.with_left_right_check:
+        if with_left_right_check:
             # Mirrored, the right view is a left one.
             mirrored = self._match_padded(right_view.flip(-1), left_view.flip(-1), search)
             match = lower_where_disagreeing(match, mirrored.disparity_px.flip(-1))
@@ -283,7 +291,8 @@ def match_in_usual_range(
     if not isinstance(matcher, NetworkMatcher):
         return matcher.match(left, right, camera)
     search = matcher.usual_search(left.shape[1:], camera)
-    return matcher.match_within(left, right, search, camera)
+    with_check = matcher.config.with_left_right_check
+    return matcher.match_within(left, right, search, camera, with_left_right_check=with_check)
 
 
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
