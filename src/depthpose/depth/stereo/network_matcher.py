@@ -21,7 +21,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth import disparity
 from depthpose.depth.config import MatcherConfig, NetworkConfig
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.stereo.matcher import Matcher, check_views, match_from_infinity
+from depthpose.depth.stereo.matcher import Matcher, match_from_infinity
 from depthpose.depth.types import Map, Maps, Match, View, Views
 
 STEP_PX = 4
@@ -168,9 +168,8 @@ class NetworkMatcher(ABC):
             The match, at the size and on the device of ``left``.
 
         Raises:
-            InputError: as :meth:`match`.
+            InputError: a memory bound that is too small for the images.
         """
-        check_views(left, right)
         height, width = left.shape[1:]
         size = self._scale_size((height, width), search.scale, camera)
         left_view, right_view = (
@@ -277,7 +276,8 @@ def match_in_usual_range(
 ) -> Match:
     """Match a pair within the usual search of its camera, without measuring its disparities.
 
-    So views are matched that a network synthesised, and pairs in exported graphs.
+    So views are matched that a network synthesised, and pairs in exported graphs. Images are not
+    checked by networks.
 
     Args:
         matcher: a network's; any other matches in its own way.
