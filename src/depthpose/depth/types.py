@@ -1,7 +1,7 @@
 """Types of depth: the input of an estimate, the truth, matches and estimates."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -208,6 +208,15 @@ class DepthEstimate:
         if self.warning:
             parts.append(f"warning: {self.warning}")
         return f"DepthEstimate({', '.join(parts)})"
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """Anything that estimates depth: :class:`FakestereoNet`, a baseline, or your own method."""
+
+    def estimate_input(self, depth_input: DepthInput, /) -> DepthEstimate:
+        """Estimate depth of one input, whose images are in memory."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,8 +10,8 @@ from depthpose.core.devices import device_of_process, usable_device, usable_prec
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.predictions import Estimator
 from depthpose.depth.stereo import SGBMMatcher
+from depthpose.depth.types import Estimator
 from depthpose.depth.weights import MATCHERS, Use
 
 
