@@ -26,7 +26,7 @@ from depthpose.depth.predictions import CLOUD_M, OutputOptions, write_estimate
 from depthpose.depth.protocols import clamped_depth_from_disparity
 from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.synthetic import Streets
-from depthpose.depth.types import DepthError, DepthEstimate, DepthInput, DepthSample, DepthTruth
+from depthpose.depth.types import DepthEstimate, DepthInput, DepthSample, DepthTruth, ErrorMaps
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import (
     BopDataset,
@@ -194,7 +194,7 @@ def _show_scene(
 
         # Its part of the page.
         error_px = (estimate.disparity_px - truth.disparity_px).abs()
-        error = DepthError(error=error_px, is_disparity=True)
+        error = ErrorMaps(error=error_px, is_disparity=True)
         title = f"{pair.name}: {method.name}, {method.views}"
         section = make_depth_section(
             title, estimate, range_m=range_m, error=error, with_image=False

@@ -26,7 +26,7 @@ from depthpose.depth.protocols import (
     has_truth,
     prepare_frame,
 )
-from depthpose.depth.types import DepthError, DepthEstimate, DepthInput, Map
+from depthpose.depth.types import DepthEstimate, DepthInput, ErrorMaps, Map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -338,7 +338,7 @@ def _make_nothing_measured_error(
 
 def read_frame_result(
     dataset: Dataset, index: int, predictions: Path, protocol: str, cap_m: float | None
-) -> tuple[DepthEstimate, DepthError]:
+) -> tuple[DepthEstimate, ErrorMaps]:
     """Read the estimate of one frame, and compute its error at each pixel, for a page.
 
     Every map and picture has the size of the truth.
@@ -392,7 +392,7 @@ def read_frame_result(
         right=right,
         is_sky=is_sky,
     )
-    return estimate, DepthError(error=error, is_disparity=rule.is_disparity, true_depth_m=true_m)
+    return estimate, ErrorMaps(error=error, is_disparity=rule.is_disparity, true_depth_m=true_m)
 
 
 def measure_image_confidence(net: FakestereoNet, images: Iterable[DepthInput]) -> list[float]:

@@ -220,7 +220,7 @@ class Estimator(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DepthError:
+class ErrorMaps:
     """Error of an estimate at each pixel of the image."""
 
     #: absolute error of disparity [px], or that of depth as a share of the truth; NaN where no

@@ -36,8 +36,8 @@ from depthpose.core.camera.camera_file import (
     choose_kitti_pair,
     facts_from_lines,
     prefixed_errors,
-    read_kitti_matrix,
     read_kitti_size,
+    read_matrix,
 )
 from depthpose.core.camera.pinhole import Size
 from depthpose.core.errors import InputError
@@ -82,10 +82,10 @@ def read_object_calibration(
 
     # The LiDAR.
     if "Tr_velo_to_cam" in keys:
-        camera_from_velodyne = read_kitti_matrix(path, keys, "Tr_velo_to_cam", (3, 4))
-        rectify = read_kitti_matrix(path, keys, "R0_rect", (3, 3))
+        camera_from_velodyne = read_matrix(path, keys, "Tr_velo_to_cam", (3, 4))
+        rectify = read_matrix(path, keys, "R0_rect", (3, 3))
     elif "Tr" in keys:
-        camera_from_velodyne = read_kitti_matrix(path, keys, "Tr", (3, 4))
+        camera_from_velodyne = read_matrix(path, keys, "Tr", (3, 4))
         rectify = np.eye(3)
     else:
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
@@ -178,7 +178,7 @@ def _rig_from_projections(
     Raises:
         InputError: a projection is missing or damaged, or of images of another size.
     """
-    left, right = (read_kitti_matrix(path, keys, name, (3, 4)) for name in (pair.left, pair.right))
+    left, right = (read_matrix(path, keys, name, (3, 4)) for name in (pair.left, pair.right))
     stated_size = read_kitti_size(keys, pair) or size
     if stated_size != size:
         raise InputError(
@@ -371,10 +371,10 @@ def _read_raw_calibration(folder: Path, size: Size) -> KittiCalibration:
     rig, left = _rig_from_projections(camera_file, camera_keys, raw_pair, size)
     if not lidar_file.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = read_kitti_matrix(camera_file, camera_keys, "R_rect_00", (3, 3))
+    rectify = read_matrix(camera_file, camera_keys, "R_rect_00", (3, 3))
     lidar_keys = files.read_key_values(lidar_file)
-    R = read_kitti_matrix(lidar_file, lidar_keys, "R", (3, 3))
-    t = read_kitti_matrix(lidar_file, lidar_keys, "T", (3, 1))
+    R = read_matrix(lidar_file, lidar_keys, "R", (3, 3))
+    t = read_matrix(lidar_file, lidar_keys, "T", (3, 1))
     pixels_from_velodyne = _compose_projection(lidar_file, left, rectify, np.hstack([R, t]))
     return KittiCalibration(rig=rig, pixels_from_velodyne=pixels_from_velodyne)
 
