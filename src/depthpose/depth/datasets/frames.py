@@ -23,12 +23,7 @@ from depthpose.core.camera import (
     read_camera,
     read_rig,
 )
-from depthpose.core.camera.camera_facts import (
-    CameraFacts,
-    camera_from_facts,
-    facts_from_projections,
-)
-from depthpose.core.camera.camera_file import (
+from depthpose.core.camera.formats.camera_file import (
     KITTI_COLOR,
     KITTI_GREY,
     KittiPair,
@@ -38,6 +33,11 @@ from depthpose.core.camera.camera_file import (
     prefixed_errors,
     read_kitti_size,
     read_matrix,
+)
+from depthpose.core.camera.formats.facts import (
+    CameraFacts,
+    camera_from_facts,
+    facts_from_projections,
 )
 from depthpose.core.camera.pinhole import Size
 from depthpose.core.errors import InputError

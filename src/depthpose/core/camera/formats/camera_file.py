@@ -1,7 +1,7 @@
 """Reading of camera files of any known format, and writing of depthpose's own JSON.
 
 Formats of plain text are read here, JSON by ``camera_json``, files of ROS, OpenCV and ORB-SLAM by
-``stored_camera``. Each gives :class:`CameraFacts`, which ``camera_facts`` checks.
+``camera_fields``. Each gives :class:`CameraFacts`, which ``facts`` checks.
 """
 
 import re
@@ -14,7 +14,18 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from depthpose.core.camera.camera_facts import (
+from depthpose.core.camera.formats.camera_fields import (
+    facts_from_fields,
+    facts_from_folder,
+    parse_storage,
+)
+from depthpose.core.camera.formats.camera_json import (
+    DOFFS_KEY,
+    facts_from_json,
+    read_size,
+    with_json_keys,
+)
+from depthpose.core.camera.formats.facts import (
     KNOWN_FILES,
     SAME_DIFFERENCE_PX,
     CameraFacts,
@@ -23,19 +34,8 @@ from depthpose.core.camera.camera_facts import (
     facts_from_projections,
     refuse_unequal_cameras,
 )
-from depthpose.core.camera.camera_json import (
-    DOFFS_KEY,
-    facts_from_json,
-    read_size,
-    with_json_keys,
-)
 from depthpose.core.camera.lens import is_fisheye_lens
 from depthpose.core.camera.pinhole import Camera, Size, StereoRig, intrinsics
-from depthpose.core.camera.stored_camera import (
-    facts_from_fields,
-    facts_from_folder,
-    parse_storage,
-)
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_json, read_key_values, read_text, write_json
 from depthpose.core.files.disk import MAX_LIST_BYTES
