@@ -212,7 +212,7 @@ def test_arguments_that_would_not_be_used_are_refused(
     write_depth_weights(path, generator=generator, facts={})
     write_depth_weights(other, matcher=small_matcher(), facts={})
     for matcher in ("sgbm", CallableMatcher(by_brightness), other):
-        with pytest.raises(InputError, match="which match pairs alone, and so does matcher"):
+        with pytest.raises(InputError, match="matcher is given too, so nothing of these weights"):
             FakestereoNet.load(other, matcher=matcher)
     for config in (
         MatcherConfig(max_disparity_px=32),

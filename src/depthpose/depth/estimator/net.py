@@ -205,8 +205,8 @@ class FakestereoNet:
             generator = networks.generator
             if generator is None and matcher is not None:
                 raise InputError(
-                    f"weights is {str(weights)!r}, which match pairs alone, and so does matcher. "
-                    "Omit one of the two."
+                    f"weights is {str(weights)!r} and matcher is given too, so nothing of these "
+                    "weights would run. Omit one of the two."
                 )
         # A Path has a method 'match', so it would pass for a matcher: it is recognised first.
         if isinstance(matcher, str | Path) and matcher != "sgbm":
