@@ -22,6 +22,7 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import find_weights
 from depthpose.depth.config import MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.types import DepthInput
 from depthpose.report.page import format_markdown_table
 
@@ -269,7 +270,7 @@ def match_by_ours(
     views = torch.rand(2, 3, height, width)
     pair = DepthInput(name="pair", left=views[0], right=views[1], camera=rig)
     if isinstance(config, SGBMConfig):
-        net = FakestereoNet.load(matcher="sgbm", config=config, with_check=False)
+        net = FakestereoNet(SGBMMatcher(config), with_check=False)
     else:
         net = FakestereoNet.load(find_weights("default"), config=config, with_check=False)
     return lambda: net.estimate_input(pair)

@@ -21,6 +21,7 @@ from depthpose.demo import read_motorcycle
 from depthpose.depth.config import MatcherConfig, SGBMConfig
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.types import DepthSample
 from depthpose.report.page import format_markdown_table
 
@@ -61,7 +62,7 @@ def sgbm_for(sample: DepthSample) -> FakestereoNet:
     largest_px = float(truth_px[truth_px.isfinite()].max()) + max(doffs_px, 0.0)
     num_disparities = 16 * (int(largest_px) // 16 + 1)
     config = SGBMConfig(num_disparities=num_disparities, with_filled_holes=True)
-    return FakestereoNet.load(matcher="sgbm", config=config, with_check=False)
+    return FakestereoNet(SGBMMatcher(config), with_check=False)
 
 
 def measure(net: FakestereoNet, sample: DepthSample) -> dict[str, float]:

@@ -24,8 +24,9 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.metrics import measure
 from depthpose.depth.predictions import CLOUD_M, OutputOptions, write_estimate
 from depthpose.depth.protocols import clamped_depth_from_disparity
+from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.synthetic import Streets
-from depthpose.depth.types import DepthError, DepthEstimate, DepthInput, DepthSample, DepthTruth
+from depthpose.depth.types import DepthEstimate, DepthInput, DepthSample, DepthTruth, ErrorMaps
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import (
     BopDataset,
@@ -142,7 +143,7 @@ def _choose_methods(network: FakestereoNet, sample: DepthSample) -> list[_DepthM
     nearest_px = width * _MAX_DISPARITY_SHARE + max(rig.cx_right_minus_left_px, 0.0)
     num_disparities = _SGBM_STEP_PX * math.ceil(nearest_px / _SGBM_STEP_PX)
     config = SGBMConfig(num_disparities=num_disparities, with_filled_holes=True)
-    sgbm = FakestereoNet.load(matcher="sgbm", config=config, with_check=False)
+    sgbm = FakestereoNet(SGBMMatcher(config), with_check=False)
     methods.append(_DepthMethod("SGBM, holes filled", _FROM_PAIR, sgbm))
 
     if sample.input.name == "street":
@@ -193,7 +194,7 @@ def _show_scene(
 
         # Its part of the page.
         error_px = (estimate.disparity_px - truth.disparity_px).abs()
-        error = DepthError(error=error_px, is_disparity=True)
+        error = ErrorMaps(error=error_px, is_disparity=True)
         title = f"{pair.name}: {method.name}, {method.views}"
         section = make_depth_section(
             title, estimate, range_m=range_m, error=error, with_image=False

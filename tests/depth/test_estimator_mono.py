@@ -36,7 +36,14 @@ from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.evaluate import measure_image_confidence
 from depthpose.depth.generators import SelectionGenerator, UNetGenerator
-from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher, SearchRange
+from depthpose.depth.mount import MountFilter
+from depthpose.depth.stereo import (
+    CallableMatcher,
+    PSMNet,
+    PSMNetMatcher,
+    SearchRange,
+    SGBMMatcher,
+)
 from depthpose.depth.synthesis import make_synthesiser
 from depthpose.depth.types import DepthEstimate, DepthInput, Match
 from depthpose.depth.weights import (
@@ -193,9 +200,27 @@ def test_a_generator_alone_takes_any_matcher(generator: UNetGenerator, tmp_path:
         FakestereoNet.load(path)
     own = FakestereoNet.load(path, matcher=CallableMatcher(by_brightness)).estimate(image, lens)
     file = FakestereoNet.load(path, matcher=other).estimate(image, lens)
-    narrow = SGBMConfig(num_disparities=32)
-    sgbm = FakestereoNet.load(path, matcher="sgbm", config=narrow).estimate(image, lens)
+    narrow = SGBMMatcher(SGBMConfig(num_disparities=32))
+    sgbm = FakestereoNet.load(path, matcher=narrow).estimate(image, lens)
     assert [e.disparity_px.shape for e in (own, file, sgbm)] == [(40, 60)] * 3
+
+
+def test_arguments_that_would_not_be_used_are_refused(
+    generator: UNetGenerator, tmp_path: Path
+) -> None:
+    path, other = tmp_path / "g.safetensors", tmp_path / "s.safetensors"
+    write_depth_weights(path, generator=generator, facts={})
+    write_depth_weights(other, matcher=small_matcher(), facts={})
+    for matcher in ("sgbm", CallableMatcher(by_brightness), other):
+        with pytest.raises(InputError, match="matcher is given too, so nothing of these weights"):
+            FakestereoNet.load(other, matcher=matcher)
+    for config in (
+        MatcherConfig(max_disparity_px=32),
+        MatcherConfig(with_left_right_check=True),
+    ):
+        for matcher in ("sgbm", CallableMatcher(by_brightness)):
+            with pytest.raises(InputError, match=r"config sets .*Matcher does not take: it is for"):
+                FakestereoNet.load(path, matcher=matcher, config=config)
 
 
 def test_terms_of_the_weights_are_said(generator: UNetGenerator, tmp_path: Path) -> None:
@@ -488,6 +513,25 @@ def test_what_the_pipeline_cannot_take_is_one_clear_line(
 ) -> None:
     with pytest.raises(InputError, match=f"^pipeline: {re.escape(said)}"):
         depthpose.pipeline("depth-estimation", **options)
+
+
+@pytest.mark.parametrize("batch_size", [0, -1])
+def test_a_batch_of_no_picture_is_refused(batch_size: int, generator: UNetGenerator) -> None:
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
+    said = f"pipeline: batch_size is {batch_size}; take 1 or more pictures"
+    with pytest.raises(InputError, match=said):
+        DepthPipeline(net, batch_size)
+    for pictures in (RGB, [RGB]):
+        with pytest.raises(InputError, match=said):
+            DepthPipeline(net)(pictures, focal_px=100.0, batch_size=batch_size)
+
+
+def test_the_mount_of_a_pair_is_refused(generator: UNetGenerator) -> None:
+    net = FakestereoNet(
+        CallableMatcher(by_brightness), make_synthesiser(generator), with_check=False
+    )
+    with pytest.raises(InputError, match="a pair has metres of its own; omit mount, or the right"):
+        net.estimate(RGB, camera(60, 40, 100.0, 0.2), right=RGB, mount=MountFilter())
 
 
 def test_options_of_transformers_that_change_nothing_are_taken() -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from depthpose.cli.depth.evaluate import measure_and_report
 from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import write_depth_png, write_image, write_map
@@ -180,6 +181,42 @@ def test_negative_depth_is_refused(alone: Dataset, tmp_path: Path) -> None:
     write_map(tmp_path / "a.depth_m.npy", torch.full((H, W), -10.0))
     with pytest.raises(InputError, match=r"a\.depth_m\.npy: its depth is negative; save metres"):
         evaluate(alone, tmp_path, "eigen-raw-camera")
+
+
+def test_a_notice_is_given_once_for_each_evaluation(pairs: Dataset, tmp_path: Path) -> None:
+    far = write_predictions(tmp_path / "far", lambda px: px / 6)
+    squeezed = tmp_path / "squeezed"
+    for k, name in enumerate("abc"):
+        squeezed_px = resize_map(truth_px(k), H, W // 2) / 2
+        write_map(squeezed / f"{name}.disparity_px.npy", squeezed_px)
+    for folder, said in ((far, "is it without a scale"), (squeezed, "of another aspect")):
+        for _ in range(2):
+            with pytest.warns(Notice, match=said) as notices:
+                evaluate(pairs, folder, "kitti-2015")
+            assert len(notices) == 1
+            read_frame_result(pairs, 0, folder, "kitti-2015", None)
+
+
+@pytest.mark.parametrize(("protocol", "count"), [("eigen-improved", 1), ("eigen-raw-camera", 0)])
+def test_depth_of_a_plain_folder_is_not_taken_for_annotated(
+    pairs: Dataset,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    protocol: str,
+    count: int,
+) -> None:
+    folder = write_predictions(tmp_path / "p", lambda px: px)
+    measure_and_report(pairs, [folder], protocol, (80.0,), tmp_path / "out", [])
+    said = "the truth of 2 frames is lidar_depth/ of a folder of pairs: compare no numbers"
+    assert capsys.readouterr().err.count(said) == count
+
+
+def test_truth_of_both_views_has_the_size_of_the_image(pairs: Dataset, tmp_path: Path) -> None:
+    write_depth_png(tmp_path / "noc.png", torch.full((H, W + 2), 3.0))
+    frame = replace(pairs.frames[0], disparity_noc=tmp_path / "noc.png")
+    folder = write_predictions(tmp_path / "p", lambda px: px)
+    with pytest.raises(InputError, match=rf"noc\.png: is {W + 2}x{H}, but its left image is {W}x"):
+        evaluate(replace(pairs, frames=[frame]), folder, "kitti-2015")
 
 
 def test_what_a_poor_estimate_could_be_too_is_a_notice() -> None:

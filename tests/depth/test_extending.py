@@ -23,20 +23,18 @@ from depthpose.depth.config import (
     MatcherConfig,
     NetworkConfig,
     PairsConfig,
-    SelectionConfig,
 )
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.datasets.frames import FramePaths
 from depthpose.depth.datasets.layouts import LAYOUTS, Layout
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import TARGETS, Target, make_export
-from depthpose.depth.generators import SelectionGenerator, UNetGenerator
-from depthpose.depth.losses import ADVERSARIAL_LOSSES, GENERATOR_DISPARITY_LOSSES, adversarial_loss
+from depthpose.depth.generators import UNetGenerator
+from depthpose.depth.losses import ADVERSARIAL_LOSSES, adversarial_loss
 from depthpose.depth.metrics import METRICS, Metric
 from depthpose.depth.stereo import StereoNetwork
-from depthpose.depth.train.config import FinetuneTraining, SelectTraining, StereoTraining
+from depthpose.depth.train.config import FinetuneTraining, StereoTraining
 from depthpose.depth.train.runs import train_finetune, train_stereo
-from depthpose.depth.train.selection_task import SelectionSample, SelectTask
 from depthpose.depth.train.stereo_task import StereoTask
 from depthpose.depth.types import Match
 from depthpose.depth.weights import (
@@ -236,27 +234,6 @@ def test_the_worst_frame_is_that_of_the_lowest_value_where_higher_is_better(
 
 def _share_close(predicted: Tensor, true: Tensor) -> float:
     return float(((predicted - true).abs() < 1).double().mean())
-
-
-def test_extending_losses(monkeypatch: pytest.MonkeyPatch) -> None:
-    def ones(log_px: Tensor, truth_px: Tensor, range_px: tuple[float, float]) -> Tensor:
-        return log_px.mean() * 0 + 7.0
-
-    with pytest.raises(InputError, match=r"disparity_loss is 'ones'; .*'log'"):
-        SelectTraining(disparity_loss="ones")
-    monkeypatch.setitem(GENERATOR_DISPARITY_LOSSES, "ones", ones)
-    config = SelectTraining(
-        disparity_loss="ones",
-        generator=SelectionConfig(encoder_width=0.25, widths=(8, 8, 8, 8), planes=4),
-        plane_weight=0.0,
-        view_weight=0.0,
-        right_share=0.5,
-    )
-    task = SelectTask(SelectionGenerator(config.generator), config, None)
-    view, truth_px = torch.rand(1, 3, 64, 64), torch.full((1, 64, 64), 3.0)
-    sample = SelectionSample(view, view, view, truth_px, truth_px, torch.tensor([False]))
-    (turn,) = task.step(sample)
-    assert float(turn.loss.detach()) == pytest.approx(7.0 * 1.5)
 
 
 def test_extending_adversarial_losses(monkeypatch: pytest.MonkeyPatch) -> None:

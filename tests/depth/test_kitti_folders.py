@@ -266,6 +266,23 @@ def test_one_line_a_pair_gives_each_its_own_camera(tmp_path: Path) -> None:
     assert [rig.baseline_m for rig in rigs if rig is not None] == [0.5, 0.4]
 
 
+@pytest.mark.parametrize("more", ["", " 700 0"])
+def test_a_name_that_begins_with_another_and_numbers_keeps_its_own_line(
+    tmp_path: Path, more: str
+) -> None:
+    names = {"scan": 0.5, "scan 2": 0.4, "scan 2 3": 0.3}
+    lines = [f"{name} {W} {H} 700 10 6 {metres}{more}\n" for name, metres in names.items()]
+    write(tmp_path / "calib.txt", "".join(lines))
+    for name, metres in names.items():
+        assert read_plain_calibration(tmp_path / "calib.txt", name, W, H).baseline_m == metres
+
+
+def test_a_line_of_seven_numbers_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "calib.txt", f"a {W} {H} 700 10 6 0.5 710\n")
+    with pytest.raises(InputError, match=r"'a' is no calibration: .* or with eight, which go on"):
+        read_plain_calibration(tmp_path / "calib.txt", "a", W, H)
+
+
 def _truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:60])
 

@@ -143,6 +143,7 @@ def test_damaged_shards_are_refused(pairs: Path, tmp_path: Path) -> None:
         ({"left": "../../secret.png"}, "names a file outside of the folder"),
         ({"left": 3}, "is not as 'depthpose data pack' writes it"),
         ({"wrong": "x"}, "is not as 'depthpose data pack' writes it"),
+        ({"style": "rav"}, "frame 0 has the style 'rav'; did you mean 'raw'"),
     ):
         index.write_text(json.dumps({"frames": [rows["frames"][0] | change]}))
         with pytest.raises(InputError, match=said):

@@ -116,6 +116,13 @@ def test_each_folder_must_give_something(tmp_path: Path) -> None:
     assert len(TrainingPairs(PairsConfig(folders=folders), 0, needs_truth=False)) == 2
 
 
+@pytest.mark.parametrize("needs_truth", [True, False])
+def test_streets_that_are_none_are_refused(needs_truth: bool) -> None:
+    config = PairsConfig(streets=StreetsConfig(frames=0))
+    with pytest.raises(InputError, match=r"streets\.frames is 0, so there is no pair; give 1 or"):
+        TrainingPairs(config, 0, needs_truth=needs_truth)
+
+
 def test_the_record_of_a_run_says_the_truth_of_each_folder(tmp_path: Path) -> None:
     home = tmp_path / "mine"
     make_pairs(home)

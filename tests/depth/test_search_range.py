@@ -286,3 +286,28 @@ def test_principal_points_apart_move_the_search() -> None:
     is_wall[:, 290:] = False
     error_px = (found.disparity_px - truth_px).abs()[is_wall]
     assert float(error_px.median()) < 1
+
+
+@needs_weights
+def test_the_left_right_check_takes_two_runs_more_and_searches_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The narrow copy is matched both ways anyway, and its range is that without the check."""
+    left, right, _ = planes(40, 10)
+    searches: list[SearchRange] = []
+    run = LightMatcher.run
+
+    def count(self: LightMatcher, left: Tensor, right: Tensor, search: SearchRange) -> Match:
+        searches.append(search)
+        return run(self, left, right, search)
+
+    monkeypatch.setattr(LightMatcher, "run", count)
+    plain = matcher().match(left, right)
+    copy, _, search = searches
+    searches.clear()
+    config = MatcherConfig(with_left_right_check=True)
+    checking = FakestereoNet.load("default", config=config, use="pairs").matcher
+    assert isinstance(checking, LightMatcher)
+    checked = checking.match(left, right)
+    assert searches == [copy, copy, search, search]
+    assert torch.equal(checked.disparity_px, plain.disparity_px)

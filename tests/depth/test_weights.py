@@ -7,12 +7,13 @@ import torch
 from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig
-from depthpose.depth.generators import UNetGenerator
+from depthpose.depth.generators import SelectionGenerator, UNetGenerator
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.weights import (
     read_depth_weights,
     read_generator,
     read_matcher,
+    settings_of,
     write_depth_weights,
 )
 
@@ -111,3 +112,20 @@ def test_weights_of_a_pose_network_are_refused(tmp_path: Path) -> None:
     save_checkpoint(path, Checkpoint(kind="geoposenet", config={}, state={"a": torch.zeros(1)}))
     with pytest.raises(InputError, match="kind 'geoposenet'; depth takes 'generator'"):
         read_depth_weights(path)
+    with pytest.raises(InputError, match="kind 'geoposenet'; depth takes 'generator'"):
+        settings_of(read_checkpoint(path), str(path))
+
+
+def test_an_answer_is_that_of_the_file_whatever_the_use(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    config = SelectionConfig(encoder_width=0.1, widths=(4, 4, 4, 4), planes=6)
+    matcher = PSMNet(PSMNetConfig(width=2, max_disparity_px=16, blocks=(1, 1, 1, 1), pools=(2,)))
+    path = tmp_path / "both.safetensors"
+    write_depth_weights(path, generator=SelectionGenerator(config), matcher=matcher, facts=FACTS)
+    for answer in ("own", "matched"):
+        pairs = read_depth_weights(path, use="pairs", answer=answer)
+        assert (pairs.generator is None, pairs.matcher is None) == (True, False)
+        images = read_depth_weights(path, use="images", answer=answer)
+        assert images.generator is not None
+        assert images.generator.config.answer == answer
+        assert (images.matcher is None) == (answer == "own")

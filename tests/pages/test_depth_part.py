@@ -9,7 +9,7 @@ from tests.synthetic_street import make_street
 
 from depthpose.core.draw import draw_depth, draw_share
 from depthpose.core.files import PointCloud
-from depthpose.depth.types import DepthError, DepthEstimate
+from depthpose.depth.types import DepthEstimate, ErrorMaps
 from depthpose.report.depth import make_depth_section
 
 SAMPLE = make_street(0.1)
@@ -87,7 +87,7 @@ def test_the_error_is_where_the_truth_is(is_sparse: bool) -> None:
     known_m = error.clone()
     part = (slice(20, 22), slice(30, 32)) if is_sparse else (slice(None), slice(None))
     error[part], known_m[part] = 0.3, 10.0
-    wrong = DepthError(error=error, is_disparity=False, true_depth_m=known_m)
+    wrong = ErrorMaps(error=error, is_disparity=False, true_depth_m=known_m)
     section = make_depth_section("a", estimate(), error=wrong, with_image=False)
     _, truth, errors = drawings(section)
     bright = draw_share(torch.zeros(1, 1))[:, 0, 0]

@@ -16,12 +16,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from depthpose.core.camera import Camera, StereoRig
-from depthpose.core.camera.camera_facts import CameraFacts, camera_from_facts
-from depthpose.core.camera.stored_camera import (
+from depthpose.core.camera.formats.camera_fields import (
     facts_from_fields,
     facts_from_ros_pair,
     normalise_keys,
 )
+from depthpose.core.camera.formats.facts import CameraFacts, camera_from_facts
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.files.images import scale_16_bit
 from depthpose.core.rigid import Rigid, cross_matrix

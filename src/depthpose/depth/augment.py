@@ -14,7 +14,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from depthpose.core.camera.rectified import grey_from_rgb
+from depthpose.core.arrays import grey_from_rgb
 from depthpose.core.errors import InputError
 from depthpose.depth.config import AugmentConfig, DegradeConfig
 from depthpose.depth.types import View

@@ -199,6 +199,9 @@ class NetworkConfig(Settings):
     work_focal_px: Annotated[float | None, _FOCAL_PX] = None
     """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
 
+    with_sky: ClassVar[bool] = False
+    """Whether the sky is a class of its own, beside the disparities."""
+
     step_px: ClassVar[int] = 16
     """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
 
@@ -256,7 +259,7 @@ class LightConfig(NetworkConfig):
     encoder_width: Annotated[float, "(0, 4]"] = 1.0
     """Channels of the encoder as a share of EfficientNet-Lite0's; ImageNet's weights need 1."""
 
-    with_sky: bool = False
+    with_sky: bool = False  # pyright: ignore[reportIncompatibleVariableOverride]
     """Whether the sky is a class of its own, beside the disparities; weights without it can be
     trained on with it."""
 

@@ -107,6 +107,18 @@ def warp_right_to_left(right: Float[Tensor, "c h w"], disparity_px: Map) -> Floa
     return torch.where(is_inside, sampled[0], torch.nan)
 
 
+def left_right_difference(left_px: Map, right_px: Map) -> Map:
+    """Compute by how much the disparities of both views of a pair differ at the same point [px].
+
+    NaN where the matching point lies outside the right view, or has no disparity.
+
+    Args:
+        left_px: disparity of the left view.
+        right_px: disparity of the right view.
+    """
+    return (left_px - warp_right_to_left(right_px[None], left_px)[0]).abs()
+
+
 def matched_blankness(right: View, disparity_px: Map) -> Map:
     """Measure how blank the right view is where it matches each left pixel, 0..1.
 

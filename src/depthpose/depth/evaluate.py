@@ -1,5 +1,6 @@
 """Evaluation of predictions in files by a named protocol: rows of metrics."""
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -8,10 +9,11 @@ from typing import Any
 import torch
 
 from depthpose.core.data_frame import make_data_frame
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.depth import disparity
 from depthpose.depth import predictions as files
 from depthpose.depth.datasets import Dataset, read_disparity
+from depthpose.depth.datasets.frames import check_map_size
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.metrics import RANKING, error_by_decile, measure, score_confidence
 from depthpose.depth.protocols import (
@@ -24,7 +26,7 @@ from depthpose.depth.protocols import (
     has_truth,
     prepare_frame,
 )
-from depthpose.depth.types import DepthError, DepthEstimate, DepthInput, Map
+from depthpose.depth.types import DepthEstimate, DepthInput, ErrorMaps, Map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,15 +114,23 @@ def evaluate(
     Raises:
         InputError: an unknown protocol, a missing prediction, or no frame with truth.
     """
-    metrics_by_frame = {
-        dataset.frames[index].name: measure_frame(dataset, index, predictions, protocol, caps_m)
-        for index in progress(range(len(dataset)))
-    }
+    given_notices: set[str] = set()  # each once for all frames
+    metrics_by_frame: dict[str, list[FrameMetrics] | str] = {}
+    for index in progress(range(len(dataset))):
+        name = dataset.frames[index].name
+        metrics_by_frame[name] = measure_frame(
+            dataset, index, predictions, protocol, caps_m, given_notices
+        )
     return summarise(dataset, protocol, metrics_by_frame)
 
 
 def measure_frame(
-    dataset: Dataset, index: int, predictions: Path, protocol: str, caps_m: Sequence[float]
+    dataset: Dataset,
+    index: int,
+    predictions: Path,
+    protocol: str,
+    caps_m: Sequence[float],
+    given_notices: set[str] | None = None,
 ) -> list[FrameMetrics] | str:
     """Measure one frame at each cap.
 
@@ -130,6 +140,8 @@ def measure_frame(
         predictions: folder of the predictions.
         protocol: a key of ``PROTOCOLS``.
         caps_m: as for :func:`evaluate`.
+        given_notices: notices on frames before, which are not given again; those on this frame are
+            added. None: there is no frame before.
 
     Returns:
         Metrics at each cap within which the frame has truth, or the reason why it does not count.
@@ -138,7 +150,7 @@ def measure_frame(
         InputError: an unknown protocol, or a missing or damaged prediction.
     """
     rule = find_protocol(protocol)
-    prepared = prepare_frame(dataset, index, predictions, rule)
+    prepared = prepare_frame(dataset, index, predictions, rule, given_notices)
     if isinstance(prepared, str):
         return prepared
     caps: Sequence[float | None] = [None] if rule.is_disparity else caps_m
@@ -189,6 +201,8 @@ def _measure_non_occluded(prepared: PreparedFrame) -> dict[str, float]:
     if prepared.frame.disparity_noc is None:
         return {}
     truth_px = read_disparity(prepared.frame.disparity_noc)
+    height, width = prepared.truth.shape
+    check_map_size(prepared.frame.disparity_noc, truth_px, (width, height))
     is_compared = torch.isfinite(truth_px) & torch.isfinite(prepared.disparity_px)
     if not bool(is_compared.any()):
         return {}
@@ -324,7 +338,7 @@ def _make_nothing_measured_error(
 
 def read_frame_result(
     dataset: Dataset, index: int, predictions: Path, protocol: str, cap_m: float | None
-) -> tuple[DepthEstimate, DepthError]:
+) -> tuple[DepthEstimate, ErrorMaps]:
     """Read the estimate of one frame, and compute its error at each pixel, for a page.
 
     Every map and picture has the size of the truth.
@@ -342,7 +356,9 @@ def read_frame_result(
     """
     rule = find_protocol(protocol)
     name = dataset.frames[index].name
-    prepared = prepare_frame(dataset, index, predictions, rule)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Notice)  # given when the frame was measured
+        prepared = prepare_frame(dataset, index, predictions, rule)
     if isinstance(prepared, str):
         raise InputError(f"{name}: {prepared}; choose a frame that counts")
     rig = prepared.rig
@@ -376,7 +392,7 @@ def read_frame_result(
         right=right,
         is_sky=is_sky,
     )
-    return estimate, DepthError(error=error, is_disparity=rule.is_disparity, true_depth_m=true_m)
+    return estimate, ErrorMaps(error=error, is_disparity=rule.is_disparity, true_depth_m=true_m)
 
 
 def measure_image_confidence(net: FakestereoNet, images: Iterable[DepthInput]) -> list[float]:

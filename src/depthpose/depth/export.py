@@ -12,11 +12,11 @@ from torch import Tensor
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import refuse_unknown
 from depthpose.core.export import Case, Export, Limit
-from depthpose.depth.config import MatcherConfig
+from depthpose.depth.config import MatcherConfig, SelectionConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.generators import SelectionGenerator
-from depthpose.depth.graphs import image_graph, pair_graph
-from depthpose.depth.stereo import LightStereo, Matcher, StereoNetwork, match_in_usual_range
+from depthpose.depth.graphs import EXPORTED_MATCHERS, image_graph, pair_graph
+from depthpose.depth.stereo import Matcher, match_in_usual_range
 from depthpose.depth.synthesis import make_synthesiser
 from depthpose.depth.triangulation import estimate_from_pair
 from depthpose.depth.types import DepthEstimate, DepthInput, View
@@ -37,8 +37,6 @@ _SELECTING_LIMITS = {
     for name, limit in _LIMITS.items()
 } | {"is_sky": Limit(value=_MAX_FLIPPED_SHARE, of="mean")}
 """Limits of networks that choose between candidates: where two scores tie, the last bit decides."""
-_SELECTING_MATCHERS: tuple[type[StereoNetwork], ...] = (LightStereo,)
-"""Matchers that choose between candidates."""
 
 
 @dataclass(frozen=True)
@@ -102,9 +100,17 @@ def _make_pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     return Export(
         graph=lambda: pair_graph(weights),
         cases=lambda: _make_pair_cases(weights),
-        limits=_SELECTING_LIMITS if isinstance(weights.matcher, _SELECTING_MATCHERS) else _LIMITS,
+        limits=_SELECTING_LIMITS if _has_selecting_matcher(weights) else _LIMITS,
         facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], ..."},
     )
+
+
+def _has_selecting_matcher(weights: DepthWeights) -> bool:
+    """Whether weights have a matcher that chooses between candidates."""
+    if weights.matcher is None:
+        return False
+    exported = EXPORTED_MATCHERS.get(type(weights.matcher))
+    return exported is not None and exported.is_selecting
 
 
 def _make_pair_cases(weights: DepthWeights) -> Iterator[Case]:
@@ -112,7 +118,7 @@ def _make_pair_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.matcher is not None
     matcher = make_matcher(weights.matcher, _QUICK)
     outputs = ["disparity_px", "confidence"]
-    has_sky = getattr(weights.matcher.config, "with_sky", False)
+    has_sky = weights.matcher.config.with_sky
     if has_sky:
         outputs.append("is_sky")
     work_focal_px = weights.matcher.config.work_focal_px
@@ -145,14 +151,15 @@ def _make_image_cases(weights: DepthWeights) -> Iterator[Case]:
     synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
     net = FakestereoNet(matcher, synthesiser, allow_ood=True)
     outputs = ["depth_m", "disparity_px", "confidence", "right"]
-    matcher_config = None if weights.matcher is None else weights.matcher.config
-    is_selecting = isinstance(weights.generator, SelectionGenerator)
-    has_sky = is_selecting or getattr(matcher_config, "with_sky", False)
+    generator_config = weights.generator.config
+    has_sky = isinstance(generator_config, SelectionConfig)
+    if weights.matcher is not None:
+        has_sky = has_sky or weights.matcher.config.with_sky
     if has_sky:
         outputs.append("is_sky")
-    if getattr(weights.generator, "street", None):
+    if isinstance(generator_config, SelectionConfig) and generator_config.with_street:
         outputs.append("image_confidence")
-    focal_px = weights.generator.config.virtual_focal_px
+    focal_px = generator_config.virtual_focal_px
     for size in _CASE_SIZES:
         images, _, camera = _make_scenes(size, focal_px, with_sky=has_sky)
         inputs = {"image": images.numpy(), "K": camera.K.numpy()}
@@ -172,8 +179,7 @@ def _make_image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     if generator is not None:
         names = ("virtual_focal_px", "virtual_baseline_m", "answer")
         rig_facts = {name: getattr(generator.config, name) for name in names}
-    has_selecting_matcher = isinstance(weights.matcher, _SELECTING_MATCHERS)
-    is_selecting = isinstance(generator, SelectionGenerator) or has_selecting_matcher
+    is_selecting = isinstance(generator, SelectionGenerator) or _has_selecting_matcher(weights)
     return Export(
         graph=lambda: image_graph(weights),
         cases=lambda: _make_image_cases(weights),

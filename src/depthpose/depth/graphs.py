@@ -1,6 +1,7 @@
 """Depth as one ONNX graph, the estimator's own steps included."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -138,11 +139,20 @@ class DynamicLightStereo(_ExportedNetwork):
         return output.heads[-1], output.confidence, (output.sky > 0.5).float()
 
 
-DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = {
-    PSMNet: DynamicPSMNet,
-    LightStereo: DynamicLightStereo,
+@dataclass(frozen=True, kw_only=True)
+class ExportedMatcher:
+    """How a kind of matcher network is exported."""
+
+    module: Callable[[Any], nn.Module]  #: makes the module of a network, for any image size
+    #: it chooses between candidates: where two scores tie, the last bit decides
+    is_selecting: bool = False
+
+
+EXPORTED_MATCHERS: dict[type[StereoNetwork], ExportedMatcher] = {
+    PSMNet: ExportedMatcher(module=DynamicPSMNet),
+    LightStereo: ExportedMatcher(module=DynamicLightStereo, is_selecting=True),
 }
-"""Modules that matcher networks are exported as, for any image size: a new kind is one entry."""
+"""Kinds of matcher networks that are exported: a new kind is one entry."""
 
 
 class DynamicSelection(_ExportedNetwork):
@@ -306,7 +316,11 @@ _MAPS_SHAPE = ("batch", "height", "width")
 
 
 def image_graph(weights: DepthWeights) -> Graph:
-    """Make the graph of depth from one image: ``FakestereoNet.estimate`` without a right view.
+    """Make the graph of depth from one image: the networks of ``FakestereoNet.estimate``.
+
+    Left out is what follows them there: the correction by the mount of the camera, no depth and no
+    confidence in blank borders, the removal of skies that are too small to be one, and the weight
+    of the texture in the confidence of the sky.
 
     Inputs are ``image`` (batch, 3, height, width; RGB in [0, 1]) and ``K`` (3, 3; float64, of all
     images). Outputs are ``depth_m``, ``disparity_px`` (of the imitated rig, in the image's pixels),
@@ -363,7 +377,12 @@ def image_graph(weights: DepthWeights) -> Graph:
 
 
 def pair_graph(weights: DepthWeights) -> Graph:
-    """Make the graph of disparity of a rectified pair: ``FakestereoNet.estimate`` with ``right=``.
+    """Make the graph of disparity of a rectified pair, as ``match_in_usual_range`` computes it.
+
+    Of ``FakestereoNet.estimate`` with ``right=`` are left out: the check that it is a pair, the
+    measured range of the disparities with the doubts of hidden places and of what lies beyond, the
+    shift of the principal points, no disparity and no confidence in blank borders, the removal of
+    skies that are too small to be one, and the weight of the texture in the confidence.
 
     Inputs are ``left`` and ``right`` (batch, 3, height, width; RGB in [0, 1]), and ``K`` (3, 3;
     float64) where the weights were trained at one focal length. Outputs are ``disparity_px`` and
@@ -379,7 +398,7 @@ def pair_graph(weights: DepthWeights) -> Graph:
     left = graph.input("left", np.float32, _IMAGES_SHAPE)
     right = graph.input("right", np.float32, _IMAGES_SHAPE)
     focal_px = None
-    if getattr(weights.matcher.config, "work_focal_px", None) is not None:
+    if weights.matcher.config.work_focal_px is not None:
         K = graph.input("K", np.float64, (3, 3))
         focal_px = K.op("Reshape", [-1]).op("Gather", [4, 0])  # fy, fx
     disparity_px, confidence, sky = _add_matcher(left, right, focal_px, weights.matcher)
@@ -409,13 +428,13 @@ def _add_matcher(
     Raises:
         InputError: the network is of a kind that is not exported.
     """
-    if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
-        kinds = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
+    if type(matcher) not in EXPORTED_MATCHERS:
+        kinds = ", ".join(kind.__name__ for kind in EXPORTED_MATCHERS)
         raise InputError(
             f"the matcher is {type(matcher).__name__}, and no file is made of it; give weights of "
             f"one of {kinds}."
         )
-    network = DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
+    network = EXPORTED_MATCHERS[type(matcher)].module(matcher).eval()
     config = matcher.config
     graph = left.graph
     size = left.op("Shape", start=2, end=4)

@@ -16,8 +16,8 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from depthpose.core.arrays import grey_from_rgb
 from depthpose.core.camera import Camera
-from depthpose.core.camera.rectified import grey_from_rgb
 from depthpose.depth.types import View
 
 _MAX_PIXELS = 500_000

@@ -15,7 +15,7 @@ from depthpose.core.files.disk import read_text
 from depthpose.core.run_folder import claim_folder, claim_names, is_result_finished, note_result
 from depthpose.depth.config import Settings
 from depthpose.depth.datasets import Dataset
-from depthpose.depth.disparity import warp_right_to_left
+from depthpose.depth.disparity import left_right_difference
 from depthpose.depth.estimator import FakestereoNet, check_rectified_pair
 from depthpose.depth.types import DepthInput, Map
 
@@ -140,7 +140,7 @@ def label_pair(net: FakestereoNet, pair: DepthInput, config: LabelConfig) -> Map
 
     left_px = estimate.disparity_px
     right_px = mirrored_estimate.disparity_px.flip(-1)
-    difference_px = (left_px - warp_right_to_left(right_px[None], left_px)[0]).abs()
+    difference_px = left_right_difference(left_px, right_px)
     limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
     is_labelled = difference_px <= limit_px
     if estimate.confidence is not None:

@@ -138,13 +138,6 @@ def _average_images(error: Maps, has_truth: Bool[Tensor, "b h w"]) -> Float[Tens
     return means.sum() / (counts > 0).sum().clamp(min=1)
 
 
-GENERATOR_DISPARITY_LOSSES: dict[str, Callable[[Tensor, Tensor, tuple[float, float]], Tensor]] = {
-    "log": log_disparity_loss,
-}
-"""Losses of a generator that selects, by their names in configs: a new one is a function of the
-log of disparity, the true disparity (NaN: unknown, 0: sky) and its range, and one entry here."""
-
-
 def plane_loss(
     logits: Float[Tensor, "b classes rows columns"],
     truth_px: Float[Tensor, "b rows columns"],

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -20,17 +20,7 @@ from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.depth.config import COLOR_RANGE_M
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
-from depthpose.depth.types import DepthEstimate, DepthInput, Ground, Map
-
-
-@runtime_checkable
-class Estimator(Protocol):
-    """Anything that estimates depth: :class:`FakestereoNet`, a baseline, or your own method."""
-
-    def estimate_input(self, depth_input: DepthInput, /) -> DepthEstimate:
-        """Estimate depth of one input, whose images are in memory."""
-        ...
-
+from depthpose.depth.types import DepthEstimate, DepthInput, Estimator, Ground, Map
 
 _DISPARITY = ("disparity_px.npy", "disparity_px.pfm")
 _DEPTH = ("depth_m.npy", "depth_m.pfm", "depth.png")

@@ -29,8 +29,6 @@ pixels, often to multiples of 32."""
 _CROP_ERROR_SHARE = 0.7
 """A map is a crop of the image where its error as a crop is below this share of its error as a
 stretched map."""
-_noticed_sizes: set[str] = set()
-"""Sizes of stretched maps of which a notice was given already."""
 NO_PREDICTION = "no right view to match, and no prediction"
 
 
@@ -119,7 +117,11 @@ def clamped_depth_from_disparity(disparity_px: Map, rig: StereoRig, cap_m: float
 
 
 def prepare_frame(
-    dataset: Dataset, index: int, predictions: Path, protocol: Protocol
+    dataset: Dataset,
+    index: int,
+    predictions: Path,
+    protocol: Protocol,
+    given_notices: set[str] | None = None,
 ) -> PreparedFrame | str:
     """Read truth and prediction of a frame, at the size of the truth.
 
@@ -128,6 +130,8 @@ def prepare_frame(
         index: number of the frame.
         predictions: folder of the predictions.
         protocol: says which truth is read.
+        given_notices: notices on frames before, which are not given again; those on this frame are
+            added. None: there is no frame before.
 
     Returns:
         Both, or the reason why the frame is not measured.
@@ -135,6 +139,7 @@ def prepare_frame(
     Raises:
         InputError: the prediction is missing or damaged, or of another unit, sign or size.
     """
+    given_notices = set() if given_notices is None else given_notices
     frame = dataset.frames[index]
     path = predictions / frame.name
     if not has_truth(frame, protocol):
@@ -166,12 +171,14 @@ def prepare_frame(
     true_px = truth
     if not protocol.is_disparity and rig is not None:
         true_px = disparity.disparity_from_depth(truth, rig)
-    predicted_px = _resize_to_truth(true_px, stored_px, path)
+    predicted_px = _resize_to_truth(true_px, stored_px, path, given_notices)
 
     # Refuse mistaken units and signs. Where principal points differ, the disparity of far points is
     # negative; the sum with their difference is not.
     cx_difference_px = 0.0 if rig is None else rig.cx_right_minus_left_px
-    mistake = find_unit_mistake(predicted_px + cx_difference_px, true_px + cx_difference_px)
+    mistake = find_unit_mistake(
+        predicted_px + cx_difference_px, true_px + cx_difference_px, given_notices
+    )
     if mistake is not None:
         raise InputError(f"{path}: {mistake}")
 
@@ -225,11 +232,19 @@ def _measure_view(frame: FramePaths, predictions: Path) -> dict[str, float]:
     return view_errors(synthesised, real)
 
 
-def _resize_to_truth(true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path) -> Map:
+def _resize_to_truth(
+    true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path, given_notices: set[str]
+) -> Map:
     """Resize a predicted disparity, in pixels of its own width, to the size of the truth.
 
     A map of another aspect, as of a network that takes squeezed images, is stretched, with a
-    notice. ``true_px``: the true disparity; ``path``: names the prediction in errors.
+    notice.
+
+    Args:
+        true_px: the true disparity.
+        stored_px: the prediction, as it was read.
+        path: names the prediction in errors.
+        given_notices: as for :func:`prepare_frame`.
 
     Raises:
         InputError: the map is transposed, or a crop of the image's.
@@ -247,8 +262,8 @@ def _resize_to_truth(true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path) 
         raise InputError(f"{path}: is {sizes}: it is transposed; save rows first, (H, W)")
     if rows <= height and columns <= width:
         _refuse_crop(true_px, stored_px, stretched_px, f"{path}: is {sizes}")
-    if sizes not in _noticed_sizes:
-        _noticed_sizes.add(sizes)  # once for all frames of a dataset
+    if sizes not in given_notices:
+        given_notices.add(sizes)
         message = (
             f"{path}: is {sizes}, of another aspect, so it is stretched, which is right for a "
             "squeezed image; of a cropped one, paste the result into a map of the image's size "

@@ -12,7 +12,7 @@ from depthpose.depth.disparity import (
     disparity_from_depth,
     matched_blankness,
 )
-from depthpose.depth.types import DepthEstimate, DepthInput, Match, View
+from depthpose.depth.types import DepthEstimate, DepthInput, Mask, Match, View
 from depthpose.depth.visible import find_blank_borders, measure_texture
 
 _MIN_SKY_SHARE = 0.002
@@ -35,14 +35,15 @@ def estimate_from_pair(pair: DepthInput, match: Match) -> DepthEstimate:
         pair: the images, and their rig where it is known.
         match: the match, at the size of the images.
     """
-    match = _without_false_sky(match, pair.left)
+    is_blank = find_blank_borders(pair.left).to(match.disparity_px.device)
+    match = _without_false_sky(match, is_blank)
     if match.confidence is not None and pair.right is not None:
         texture = measure_texture(pair.left).to(match.confidence)
         right_is_blank = matched_blankness(pair.right, match.disparity_px) > 0.5
         confidence = (match.confidence * texture).masked_fill(right_is_blank, 0.0)
         match = replace(match, confidence=confidence)
     rig = pair.camera if isinstance(pair.camera, StereoRig) else None
-    return triangulate(match, pair, rig)
+    return _triangulate(match, pair, rig, is_blank)
 
 
 def estimate_from_virtual(
@@ -60,7 +61,8 @@ def estimate_from_virtual(
     """
     camera = image.camera
     assert camera is not None
-    match = _without_false_sky(match, image.left)
+    is_blank = find_blank_borders(image.left).to(match.disparity_px.device)
+    match = _without_false_sky(match, is_blank)
     if match.confidence is not None and match.is_sky is not None:
         sky_confidence = match.confidence * measure_texture(image.left).to(match.confidence)
         confidence = torch.where(match.is_sky, sky_confidence, match.confidence)
@@ -68,10 +70,12 @@ def estimate_from_virtual(
     rig = StereoRig(
         width=camera.width, height=camera.height, K=camera.K, baseline_m=virtual_baseline_m
     )
-    return replace(triangulate(match, image, rig), right=right)
+    return replace(_triangulate(match, image, rig, is_blank), right=right)
 
 
-def triangulate(match: Match, depth_input: DepthInput, rig: StereoRig | None) -> DepthEstimate:
+def _triangulate(
+    match: Match, depth_input: DepthInput, rig: StereoRig | None, is_blank: Mask
+) -> DepthEstimate:
     """Make the estimate of an image from its match by triangulation.
 
     Where the image is blank there is neither disparity nor depth (NaN), and no confidence. The sky
@@ -82,6 +86,7 @@ def triangulate(match: Match, depth_input: DepthInput, rig: StereoRig | None) ->
         depth_input: the image. Where its camera is a rig, the estimate's disparity is of that rig.
         rig: rig of the match, with the camera of the image; None: it is not known, and there are
             no metres.
+        is_blank: pixels of blank borders.
     """
     disparity_px = match.disparity_px
     depth_m = None
@@ -101,7 +106,6 @@ def triangulate(match: Match, depth_input: DepthInput, rig: StereoRig | None) ->
         if depth_m is not None:
             depth_m = torch.where(match.is_sky, torch.nan, depth_m)
 
-    is_blank = find_blank_borders(depth_input.left).to(disparity_px.device)
     disparity_px = disparity_px.masked_fill(is_blank, torch.nan)
     if depth_m is not None:
         depth_m = depth_m.masked_fill(is_blank, torch.nan)
@@ -118,7 +122,7 @@ def triangulate(match: Match, depth_input: DepthInput, rig: StereoRig | None) ->
     )
 
 
-def _without_false_sky(match: Match, left: View) -> Match:
+def _without_false_sky(match: Match, is_blank: Mask) -> Match:
     """Return a match without sky in blank borders, and without any where it covers too little.
 
     What was taken for sky with the probability p has a disparity with a confidence of at most 1 - p
@@ -126,11 +130,11 @@ def _without_false_sky(match: Match, left: View) -> Match:
 
     Args:
         match: the match, at the size of the image.
-        left: the image.
+        is_blank: pixels of blank borders.
     """
     if match.is_sky is None:
         return match
-    is_sky = match.is_sky & ~find_blank_borders(left).to(match.is_sky.device)
+    is_sky = match.is_sky & ~is_blank
     if float(is_sky.float().mean()) < _MIN_SKY_SHARE:
         is_sky = torch.zeros_like(is_sky)
     confidence = match.confidence

@@ -1,7 +1,7 @@
 """Types of depth: the input of an estimate, the truth, matches and estimates."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -137,7 +137,8 @@ class DepthEstimate:
 
         Args:
             min_confidence: 0..1; None: 0.5 for a pair, from which the disparity is more probably
-                right within 15 % than wrong; 0 for a single image.
+                right than wrong (within 15 % by the light matcher, within 2 px by PSMNet); 0 for a
+                single image.
         """
         values = self.disparity_px if self.depth_m is None else self.depth_m
         is_estimated = torch.isfinite(values)
@@ -209,8 +210,17 @@ class DepthEstimate:
         return f"DepthEstimate({', '.join(parts)})"
 
 
+@runtime_checkable
+class Estimator(Protocol):
+    """Anything that estimates depth: :class:`FakestereoNet`, a baseline, or your own method."""
+
+    def estimate_input(self, depth_input: DepthInput, /) -> DepthEstimate:
+        """Estimate depth of one input, whose images are in memory."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DepthError:
+class ErrorMaps:
     """Error of an estimate at each pixel of the image."""
 
     #: absolute error of disparity [px], or that of depth as a share of the truth; NaN where no

@@ -33,17 +33,24 @@ _NEGATIVE_SHARE = 0.9
 """Share of the pixels with a negative disparity from which the sign is wrong."""
 _OPPOSITE_CORRELATION = -0.8
 """Correlation of the logarithms of prediction and truth, below which one is inverted."""
-_given_notices: set[str] = set()
-"""Questions that were asked in a notice already."""
 
 
-def find_unit_mistake(predicted_px: Map, true_px: Map) -> str | None:
+def find_unit_mistake(
+    predicted_px: Map, true_px: Map, given_notices: set[str] | None = None
+) -> str | None:
     """Find the mistake of unit or sign in a predicted disparity, by its truth.
+
+    Args:
+        predicted_px: the prediction.
+        true_px: the truth.
+        given_notices: notices on earlier frames of the dataset, which are not given again; those on
+            this frame are added. None: there is no earlier frame.
 
     Returns:
         The mistake and its remedy, as a sentence for an error; None where there is none, or only
-        one that a poor estimate could look like too. Of such a one a notice is given, once.
+        one that a poor estimate could look like too. Of such a one a notice is given.
     """
+    given_notices = set() if given_notices is None else given_notices
     is_compared = torch.isfinite(predicted_px) & torch.isfinite(true_px)
     if not bool(is_compared.any()):
         return None
@@ -69,10 +76,11 @@ def find_unit_mistake(predicted_px: Map, true_px: Map) -> str | None:
         if question is None:
             question = "is it without a scale, or of another focal length or baseline?"
         times = f"{depth_ratio:.3g} times as far as the truth in the median"
-        _give_notice_once(f"lies {times}:", question)
+        _give_notice_once(f"lies {times}:", question, given_notices)
     logarithms = torch.stack([predicted_px, true_px]).double().clamp_min(1e-3).log()
     if len(true_px) > 1 and float(logarithms.corrcoef()[0, 1]) < _OPPOSITE_CORRELATION:
-        _give_notice_once("is the nearer the farther its truth is:", "is it inverse depth?")
+        statement = "is the nearer the farther its truth is:"
+        _give_notice_once(statement, "is it inverse depth?", given_notices)
     return None
 
 
@@ -86,11 +94,12 @@ def _find_mistake(
     return None
 
 
-def _give_notice_once(statement: str, question: str) -> None:
+def _give_notice_once(statement: str, question: str, given_notices: set[str]) -> None:
     """Give a notice about a prediction, once for all frames of a dataset.
 
-    ``statement`` goes on from "a prediction"; ``question`` asks for a mistake.
+    ``statement`` goes on from "a prediction"; ``question`` asks for a mistake. It is added to
+    ``given_notices``.
     """
-    if question not in _given_notices:
-        _given_notices.add(question)
+    if question not in given_notices:
+        given_notices.add(question)
         warnings.warn(f"a prediction {statement} {question}", Notice, stacklevel=3)

@@ -9,7 +9,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional as F
 
-from depthpose.core.camera.rectified import grey_from_rgb
+from depthpose.core.arrays import grey_from_rgb
 
 _MAX_VARIATION = 3 / 255
 """Largest variation of the values in a border of one colour: noise of JPEG and videos."""

@@ -95,34 +95,43 @@ def read_depth_weights(
             that they cannot give.
     """
     checkpoint = checkpoints.read_checkpoint(path)
-    if checkpoint.kind not in (*_list_kinds(), BOTH):
-        raise InputError(
-            f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
-            f"{', '.join(map(repr, _list_kinds()))} or {BOTH!r}."
-        )
     is_both = checkpoint.kind == BOTH
     parts = _split(checkpoint, path) if is_both else {checkpoint.kind: checkpoint}
+    configs = {
+        kind: _read_network_config(kind, part.config, str(path)) for kind, part in parts.items()
+    }
+    if answer is not None:
+        generator_kind = next((kind for kind in configs if kind in GENERATORS), None)
+        if generator_kind is None:
+            raise InputError(_no_answer(answer))
+        configs[generator_kind] = _with_answer(configs[generator_kind], answer)
 
-    # Generators come first: with one that estimates disparity itself, images need no matcher.
     networks: dict[str, Any] = {}
-    for kind, part in parts.items():
-        is_generator = kind in GENERATORS
-        if use == "pairs" and is_both and is_generator:
-            continue
-        config = _read_network_config(kind, part.config, str(path))
-        if is_generator and answer is not None:
-            config = _with_answer(config, answer)
-        make = partial(_list_kinds()[kind].network, config)
-        networks[kind] = checkpoints.build_network(make, part, str(path)).eval()
-        if use == "images" and is_generator and config.answer == "own":
-            break
-    if answer is not None and not networks.keys() & GENERATORS.keys():
-        raise InputError(_no_answer(answer))
+    for kind in _choose_kinds(configs, use):
+        make = partial(_list_kinds()[kind].network, configs[kind])
+        networks[kind] = checkpoints.build_network(make, parts[kind], str(path)).eval()
     return DepthWeights(
         generator=next((networks[kind] for kind in GENERATORS if kind in networks), None),
         matcher=next((networks[kind] for kind in MATCHERS if kind in networks), None),
         facts=checkpoint.facts,
     )
+
+
+def _choose_kinds(configs: Mapping[str, Any], use: Use | None) -> list[str]:
+    """Choose the networks that a use takes; a file of one network is built for any use.
+
+    ``configs``: those of the file's networks, by kind.
+    """
+    kinds = list(configs)
+    if len(kinds) == 1 or use is None:
+        return kinds
+    if use == "pairs":
+        return [kind for kind in kinds if kind in MATCHERS]
+
+    # Images need no matcher where the generator estimates disparity itself.
+    generator_kinds = [kind for kind in kinds if kind in GENERATORS]
+    has_own_answer = any(configs[kind].answer == "own" for kind in generator_kinds)
+    return generator_kinds if has_own_answer else kinds
 
 
 def _with_answer(
@@ -172,7 +181,16 @@ def _split(checkpoint: checkpoints.Checkpoint, path: Path) -> dict[str, checkpoi
 
 
 def _read_network_config(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
-    """Make the config of a network from the metadata of its file; ``source`` is for errors."""
+    """Make the config of a network from the metadata of its file; ``source`` is for errors.
+
+    Raises:
+        InputError: the kind is unknown, or a setting.
+    """
+    if kind not in _list_kinds():
+        raise InputError(
+            f"{source}: holds weights of kind {kind!r}; depth takes "
+            f"{', '.join(map(repr, _list_kinds()))} or {BOTH!r}."
+        )
     return config_from_dict(settings, _list_kinds()[kind].config, source=source)
 
 
@@ -182,7 +200,7 @@ def settings_of(checkpoint: checkpoints.Checkpoint, source: str) -> dict[str, An
     Settings that the file does not hold are at their defaults. ``source``: the file, for errors.
 
     Raises:
-        InputError: a setting is unknown, or its value is not allowed.
+        InputError: the kind is unknown, or a setting, or its value is not allowed.
     """
     if checkpoint.kind != BOTH:
         return config_to_dict(_read_network_config(checkpoint.kind, checkpoint.config, source))

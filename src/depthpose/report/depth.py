@@ -16,7 +16,7 @@ from depthpose.core.draw import (
 )
 from depthpose.core.files import PointCloud
 from depthpose.depth.config import COLOR_RANGE_M
-from depthpose.depth.types import DepthError, DepthEstimate, DepthInput, Map
+from depthpose.depth.types import DepthEstimate, DepthInput, ErrorMaps, Map
 from depthpose.report.page import (
     Drawing,
     Layer,
@@ -45,7 +45,7 @@ def make_depth_section(
     text: str = "",
     *,
     range_m: tuple[float, float] = COLOR_RANGE_M,
-    error: DepthError | None = None,
+    error: ErrorMaps | None = None,
     with_image: bool = True,
 ) -> Section:
     """Make the section of an estimate: its facts, its maps as pictures, and its points in 3D.
@@ -99,7 +99,7 @@ def make_depth_section(
 
 
 def _draw_errors(
-    depth_input: DepthInput, error: DepthError, range_m: tuple[float, float]
+    depth_input: DepthInput, error: ErrorMaps, range_m: tuple[float, float]
 ) -> list[Drawing]:
     """Draw the true depth, if it is known in metres, and the error of each pixel.
 

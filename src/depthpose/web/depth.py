@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from depthpose.core.camera import StereoRig, camera_of, write_camera
-from depthpose.core.camera.camera_facts import camera_keys
+from depthpose.core.camera.formats.facts import camera_keys
 from depthpose.core.draw import draw_share
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_exif_focal, read_image, write_image

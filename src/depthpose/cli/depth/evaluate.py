@@ -21,7 +21,13 @@ from depthpose.core.run_folder import read_settings
 from depthpose.core.runner import Job
 from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
-from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, refuse_shared_frames
+from depthpose.depth.datasets import (
+    Dataset,
+    join_datasets,
+    list_truth_kinds,
+    open_dataset,
+    refuse_shared_frames,
+)
 from depthpose.depth.evaluate import (
     Evaluation,
     EvaluationRow,
@@ -216,8 +222,8 @@ def measure_and_report(
     page.write_table(out, rows)
 
     text = f"{protocol}: {PROTOCOLS[protocol].summary}."
-    advice = _advise_on_calibration(dataset)
-    if advice is not None:
+    advices = (_advise_on_calibration(dataset), _advise_on_truth(dataset, protocol))
+    for advice in filter(None, advices):
         print(f"depthpose: {advice}", file=sys.stderr)
         text += f" {advice}."
 
@@ -258,6 +264,23 @@ def _advise_on_calibration(dataset: Dataset) -> str | None:
         "them at their own focal length, not at the one it knows: compare no numbers with "
         "those of frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its "
         "own)"
+    )
+
+
+def _advise_on_truth(dataset: Dataset, protocol: str) -> str | None:
+    """Advise that depth maps of plain folders need not be annotated ones; None: there are none."""
+    if PROTOCOLS[protocol].truth != "depth":
+        return None
+    plain_count = sum(
+        frame.depth is not None and "annotated" not in list_truth_kinds(frame)
+        for frame in dataset.frames
+    )
+    if not plain_count:
+        return None
+    return (
+        f"the truth of {plain_count} frames is lidar_depth/ of a folder of pairs: compare no "
+        f"numbers with those of {protocol} elsewhere unless it holds annotated maps (of scans, "
+        "take eigen-raw-camera)"
     )
 
 
@@ -407,6 +430,7 @@ def measure_shards(
     settings = read_settings(predictions)
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
     measured: dict[str, list[FrameMetrics] | str] = {}
+    given_notices: set[str] = set()  # each once for all frames
     for shard in tqdm(engine.read_records(predictions), name, disable=None, unit=" shards"):
         for frame, files in engine.read_shard(predictions, shard):
             if frame not in index_of:
@@ -417,7 +441,7 @@ def measure_shards(
                     path.parent.mkdir(parents=True, exist_ok=True)
                     path.write_bytes(content)
                 measured[frame] = measure_frame(
-                    dataset, index_of[frame], Path(folder), protocol, caps_m
+                    dataset, index_of[frame], Path(folder), protocol, caps_m, given_notices
                 )
 
     # Frames without a prediction: those without truth are skipped, others are an error.

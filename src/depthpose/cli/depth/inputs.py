@@ -20,7 +20,7 @@ from depthpose.core.camera import (
     read_camera,
     refuse_unusable_focal,
 )
-from depthpose.core.camera.camera_facts import camera_keys
+from depthpose.core.camera.formats.facts import camera_keys
 from depthpose.core.engine import InputFormat
 from depthpose.core.errors import InputError
 from depthpose.core.files import (

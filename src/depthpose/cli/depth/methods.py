@@ -10,8 +10,8 @@ from depthpose.core.devices import device_of_process, usable_device, usable_prec
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.predictions import Estimator
 from depthpose.depth.stereo import SGBMMatcher
+from depthpose.depth.types import Estimator
 from depthpose.depth.weights import MATCHERS, Use
 
 
@@ -42,7 +42,7 @@ class SGBMSpec:
         """Build the matcher, with the settings of our tables."""
         config = SGBMConfig(with_filled_holes=self.with_filled_holes)
         name = "sgbm-filled" if self.with_filled_holes else "sgbm"
-        net = FakestereoNet.load(matcher="sgbm", config=config, with_check=self.with_check)
+        net = FakestereoNet(SGBMMatcher(config), with_check=self.with_check)
         return DepthMethod(name, net, {"matcher": "sgbm", **asdict(config)})
 
     def with_packed_weights(self) -> "SGBMSpec":

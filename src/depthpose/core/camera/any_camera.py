@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.camera.camera_facts import CameraFacts, camera_from_facts
-from depthpose.core.camera.camera_file import read_camera
-from depthpose.core.camera.camera_json import facts_from_json
+from depthpose.core.camera.formats.camera_file import read_camera
+from depthpose.core.camera.formats.camera_json import facts_from_json
+from depthpose.core.camera.formats.facts import CameraFacts, camera_from_facts
 from depthpose.core.camera.pinhole import Camera, Size, check_intrinsics, intrinsics
 from depthpose.core.errors import InputError
 

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn import functional
 
+from depthpose.core.arrays import grey_from_rgb
 from depthpose.core.errors import InputError
 
 # Matching of corners.
@@ -51,7 +52,6 @@ _INLIER_MEDIANS = 2.5  # residual of an inlier, in medians of all residuals
 # Search for the change of a right image that does not match.
 _TRIED_CORNERS = 100  # corners that are matched to a mirrored, rotated or scaled right image
 _MIN_TRIED_MATCHES = 20  # least number of these corners that match
-_LUMA = (0.299, 0.587, 0.114)  # shares of red, green and blue in the brightness, ITU-R BT.601
 _TRIED_CHANGES = [
     *((sign * angle, 1.0) for angle in (90.0, 20.0, 40.0, 65.0) for sign in (1, -1)),
     (0.0, 1.5), (0.0, 0.67),
@@ -510,11 +510,6 @@ def _fit_rows(from_centre_px: Shaped[Tensor, "n 2"], lower_px: Shaped[Tensor, " 
         scale=1 + y_slope,
         residual_px=_MAD_TO_DEVIATION * float(residual_px.median()),
     )
-
-
-def grey_from_rgb(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
-    """Compute the brightness of an RGB image (luma of ITU-R BT.601)."""
-    return (image * image.new_tensor(_LUMA)[:, None, None]).sum(0)
 
 
 def _reduce_to_grey(image: Float[Tensor, "3 h w"], pixels: int) -> Float[Tensor, "h2 w2"]:

@@ -12,17 +12,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from depthpose.core.camera.camera_facts import (
-    WIDE_BASELINE_M,
-    camera_from_facts,
-    facts_from_projections,
-    refuse_baseline,
-    refuse_unequal_focal_lengths,
-)
-from depthpose.core.camera.camera_file import prefixed_errors
-from depthpose.core.camera.lens import is_fisheye_lens
-from depthpose.core.camera.pinhole import Size, StereoRig, check_intrinsics, intrinsics
-from depthpose.core.camera.stored_camera import (
+from depthpose.core.camera.formats.camera_fields import (
     Fields,
     find_matrix,
     find_size,
@@ -34,6 +24,16 @@ from depthpose.core.camera.stored_camera import (
     parse_storage,
     read_pair_files,
 )
+from depthpose.core.camera.formats.camera_file import prefixed_errors
+from depthpose.core.camera.formats.facts import (
+    WIDE_BASELINE_M,
+    camera_from_facts,
+    facts_from_projections,
+    refuse_baseline,
+    refuse_unequal_focal_lengths,
+)
+from depthpose.core.camera.lens import is_fisheye_lens
+from depthpose.core.camera.pinhole import Size, StereoRig, check_intrinsics, intrinsics
 from depthpose.core.errors import InputError, Notice, import_opencv
 from depthpose.core.files import AnyPath, read_json, read_text
 from depthpose.core.files.disk import MAX_LIST_BYTES

@@ -6,7 +6,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from depthpose.core.camera.rectified import check_rectified, grey_from_rgb
+from depthpose.core.arrays import grey_from_rgb
+from depthpose.core.camera.rectified import check_rectified
 
 Arrangement = Literal["side by side", "top and bottom"]
 _ROWS = 32  # rows of the small copies of both halves, which are compared

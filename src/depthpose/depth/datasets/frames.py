@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -23,12 +23,7 @@ from depthpose.core.camera import (
     read_camera,
     read_rig,
 )
-from depthpose.core.camera.camera_facts import (
-    CameraFacts,
-    camera_from_facts,
-    facts_from_projections,
-)
-from depthpose.core.camera.camera_file import (
+from depthpose.core.camera.formats.camera_file import (
     KITTI_COLOR,
     KITTI_GREY,
     KittiPair,
@@ -36,8 +31,13 @@ from depthpose.core.camera.camera_file import (
     choose_kitti_pair,
     facts_from_lines,
     prefixed_errors,
-    read_kitti_matrix,
     read_kitti_size,
+    read_matrix,
+)
+from depthpose.core.camera.formats.facts import (
+    CameraFacts,
+    camera_from_facts,
+    facts_from_projections,
 )
 from depthpose.core.camera.pinhole import Size
 from depthpose.core.errors import InputError
@@ -82,10 +82,10 @@ def read_object_calibration(
 
     # The LiDAR.
     if "Tr_velo_to_cam" in keys:
-        camera_from_velodyne = read_kitti_matrix(path, keys, "Tr_velo_to_cam", (3, 4))
-        rectify = read_kitti_matrix(path, keys, "R0_rect", (3, 3))
+        camera_from_velodyne = read_matrix(path, keys, "Tr_velo_to_cam", (3, 4))
+        rectify = read_matrix(path, keys, "R0_rect", (3, 3))
     elif "Tr" in keys:
-        camera_from_velodyne = read_kitti_matrix(path, keys, "Tr", (3, 4))
+        camera_from_velodyne = read_matrix(path, keys, "Tr", (3, 4))
         rectify = np.eye(3)
     else:
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
@@ -103,8 +103,8 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     Args:
         path: the file.
         name: name of the pair.
-        width: width of the images [px], for a file with one calibration for all pairs.
-        height: height of the images [px], likewise.
+        width: width of the images [px].
+        height: height of the images [px].
 
     Raises:
         InputError: there is no calibration of the pair, several, or one that is damaged.
@@ -114,14 +114,20 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         keys = files.read_key_values(path)
         return _make_rig(path, facts_from_lines(path, keys), (width, height))
 
-    # The line of the pair; other pairs' names may begin with this one's, and a space.
+    # The line of the pair; other pairs' names may begin with this one's, and a space. Such a name
+    # may go on with numbers, which would be another image size.
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
-    calibrations = [numbers for line in lines if len(numbers := _parse_leading_numbers(line)) >= 6]
+    numbers_of_lines = [_parse_leading_numbers(line) for line in lines]
+    calibrations = [numbers for numbers in numbers_of_lines if len(numbers) in (6, 8)]
     if lines and not calibrations:
         raise InputError(
             f"{path}: the line of {name!r} is no calibration: {lines[0][:80]!r} does not begin "
-            "with six numbers, width height focal_px cx cy baseline_m"
+            "with six numbers, width height focal_px cx cy baseline_m, or with eight, which go on "
+            "with focal_y_px cx_right_minus_left_px"
         )
+    if len(calibrations) > 1:
+        of_image_size = [numbers for numbers in calibrations if numbers[:2] == [width, height]]
+        calibrations = of_image_size or calibrations
     if len(calibrations) > 1:
         raise InputError(f"{path}: {len(calibrations)} lines for {name!r}. Keep one of them.")
     if not calibrations:
@@ -129,7 +135,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
             f"{path}: neither 'focal_px: ...' nor a line '{name} width height focal_px cx cy "
             "baseline_m'. Write focal_px, cx, cy and baseline_m, a line each."
         )
-    numbers = calibrations[0] if len(calibrations[0]) == 8 else calibrations[0][:6]
+    (numbers,) = calibrations
     columns = ("focal_px", "cx", "cy", "baseline_m", "focal_y_px", "cx_right_minus_left_px")
     values = {column: [number] for column, number in zip(columns, numbers[2:], strict=False)}
     try:
@@ -172,7 +178,7 @@ def _rig_from_projections(
     Raises:
         InputError: a projection is missing or damaged, or of images of another size.
     """
-    left, right = (read_kitti_matrix(path, keys, name, (3, 4)) for name in (pair.left, pair.right))
+    left, right = (read_matrix(path, keys, name, (3, 4)) for name in (pair.left, pair.right))
     stated_size = read_kitti_size(keys, pair) or size
     if stated_size != size:
         raise InputError(
@@ -275,6 +281,7 @@ def project_lidar(
 CalibrationStyle = Literal["raw", "object", "grey", "middlebury", "plain", "camera"]
 """Format of a frame's calibration: KITTI's raw, object, or object of the grey pair; Middlebury's;
 ``calib.txt`` of a plain folder; or a camera file."""
+CALIBRATION_STYLES: tuple[CalibrationStyle, ...] = get_args(CalibrationStyle)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -364,10 +371,10 @@ def _read_raw_calibration(folder: Path, size: Size) -> KittiCalibration:
     rig, left = _rig_from_projections(camera_file, camera_keys, raw_pair, size)
     if not lidar_file.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = read_kitti_matrix(camera_file, camera_keys, "R_rect_00", (3, 3))
+    rectify = read_matrix(camera_file, camera_keys, "R_rect_00", (3, 3))
     lidar_keys = files.read_key_values(lidar_file)
-    R = read_kitti_matrix(lidar_file, lidar_keys, "R", (3, 3))
-    t = read_kitti_matrix(lidar_file, lidar_keys, "T", (3, 1))
+    R = read_matrix(lidar_file, lidar_keys, "R", (3, 3))
+    t = read_matrix(lidar_file, lidar_keys, "T", (3, 1))
     pixels_from_velodyne = _compose_projection(lidar_file, left, rectify, np.hstack([R, t]))
     return KittiCalibration(rig=rig, pixels_from_velodyne=pixels_from_velodyne)
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.core import files
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files.disk import SOURCE, write_bytes
-from depthpose.depth.datasets.frames import FramePaths
+from depthpose.depth.datasets.frames import CALIBRATION_STYLES, FramePaths
 
 INDEX = "index.json"
 """File of a packed dataset that lists its frames; written last."""
@@ -117,6 +117,9 @@ def find_packed_frames(folder: Path) -> Iterator[FramePaths]:
         has_fields = isinstance(row, dict) and required_fields <= set(row) <= known_fields
         if not has_fields or not all(isinstance(value, str) for value in row.values()):
             raise InputError(f"{index}: frame {number} is not as 'depthpose data pack' writes it")
+        if row["style"] not in CALIBRATION_STYLES:
+            hint = suggest_name(row["style"], CALIBRATION_STYLES)
+            raise InputError(f"{index}: frame {number} has the style {row['style']!r}; {hint}")
         paths = {
             field: folder / path for field, path in row.items() if field not in ("name", "style")
         }

@@ -3,5 +3,5 @@
 from depthpose.depth.estimator.net import AnyPicture as AnyPicture
 from depthpose.depth.estimator.net import FakestereoNet as FakestereoNet
 from depthpose.depth.estimator.pair import check_rectified_pair as check_rectified_pair
-from depthpose.depth.estimator.pictures import DepthPipeline as DepthPipeline
-from depthpose.depth.estimator.pictures import pipeline as pipeline
+from depthpose.depth.estimator.transformers_pipeline import DepthPipeline as DepthPipeline
+from depthpose.depth.estimator.transformers_pipeline import pipeline as pipeline

@@ -28,7 +28,7 @@ from depthpose.core.devices import force_float32, map_in_threads
 from depthpose.core.errors import InputError, Notice, result_or_error
 from depthpose.core.files import AnyPicture as AnyPicture
 from depthpose.core.files import read_exif_focal, rgb_from_picture
-from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
+from depthpose.depth.config import Answer, MatcherConfig
 from depthpose.depth.estimator.pair import depth_from_pair
 from depthpose.depth.estimator.single_image import depth_from_images, virtual_sizes
 from depthpose.depth.mount import MountFilter, scale_by_distance, scale_by_mount
@@ -65,59 +65,30 @@ def as_input(
     return DepthInput(name=name, left=left, right=None, camera=camera_of(lens, size))
 
 
-def _choose_matcher(
-    weights: str | Path | None,
-    loaded: DepthWeights | None,
-    matcher: str | Path | Matcher | None,
-    loaded_matcher: DepthWeights | None,
-    config: MatcherConfig | SGBMConfig | None,
-) -> Matcher | None:
-    """Choose the matcher of an estimator: OpenCV's, the caller's, that of weights, or none.
-
-    Args:
-        weights: what :meth:`FakestereoNet.load` was asked for.
-        loaded: the networks of ``weights``.
-        matcher: the matcher that :meth:`FakestereoNet.load` was asked for.
-        loaded_matcher: the networks of ``matcher``, where that names weights.
-        config: how the matcher runs.
-
-    Returns:
-        None where the generator estimates disparity itself and no matcher was asked for.
-
-    Raises:
-        InputError: there is no matcher, or one that the other arguments do not fit.
-    """
-    generator = None if loaded is None else loaded.generator
-    if isinstance(config, SGBMConfig) and matcher != "sgbm":
-        raise InputError(
-            f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a MatcherConfig"
-        )
-
-    # OpenCV's, or the caller's.
-    if matcher == "sgbm":
-        if loaded is not None and generator is None:
-            raise InputError(
-                f"weights is {str(weights)!r} and matcher is 'sgbm', which takes no weights of "
-                "a matcher. Omit one of the two."
-            )
-        return SGBMMatcher(config if isinstance(config, SGBMConfig) else SGBMConfig())
-    if matcher is not None and not isinstance(matcher, str | Path):
-        return matcher
-
-    # That of weights: those that ``matcher`` names come first.
-    source = loaded if loaded_matcher is None else loaded_matcher
-    if source is not None and source.matcher is not None:
-        run_config = config if isinstance(config, MatcherConfig) else MatcherConfig()
-        return make_matcher(source.matcher, run_config)
-    if matcher is None and generator is not None and generator.config.answer == "own":
-        return None
-    raise InputError(
+def _no_matcher_error(weights: str | Path | None, matcher: str | Path | None) -> InputError:
+    """Word the error of an estimator without the matcher that it needs, by what was asked for."""
+    return InputError(
         f"weights is {weights and str(weights)!r} and matcher is "
         f"{matcher and str(matcher)!r}: there is no matcher in that. Give "
         "weights='psmnet.safetensors' or matcher='sgbm', which needs none; a generator and "
         "a matcher become one file by 'depthpose weights pack G --matcher S --trained-on "
         "DATA --licence L --out W'."
     )
+
+
+def _refuse_unused_settings(config: MatcherConfig, matcher: Matcher) -> None:
+    """Refuse settings of a match that a matcher without weights does not know.
+
+    Raises:
+        InputError: one is not at its default.
+    """
+    for name in ("max_disparity_px", "with_left_right_check"):
+        if getattr(config, name) != getattr(MatcherConfig, name):
+            raise InputError(
+                f"config sets {name}, which {type(matcher).__name__} does not take: it is for "
+                "matchers of weights. Omit it (SGBMMatcher(SGBMConfig(...)) has settings of its "
+                "own)"
+            )
 
 
 DEFAULT = "default"
@@ -189,7 +160,7 @@ class FakestereoNet:
         weights: str | Path | None = None,
         *,
         matcher: str | Path | Matcher | None = None,
-        config: MatcherConfig | SGBMConfig | None = None,
+        config: MatcherConfig | None = None,
         answer: Answer | None = None,
         allow_ood: bool = False,
         with_check: bool = True,
@@ -203,9 +174,10 @@ class FakestereoNet:
             weights: weights of both networks, of the generator alone (pairs then need a
                 ``matcher``), or of a matcher alone (real pairs only). None: ``default``, or
                 ``matcher`` alone. What names weights: ``core.checkpoint.find_weights``.
-            matcher: ``sgbm`` (OpenCV's), weights with a matcher by file or name, or any object that
-                is a matcher. None: that of ``weights``.
-            config: how the matcher runs.
+            matcher: ``sgbm`` (OpenCV's, with its defaults), weights with a matcher by file or name,
+                or any object that is a matcher, such as ``SGBMMatcher(SGBMConfig(...))``. None:
+                that of ``weights``.
+            config: how networks run.
             answer: where depth of one image comes from, in place of what the weights say
                 (:class:`~depthpose.depth.config.SelectionConfig`).
             allow_ood: estimate images unlike what the weights know too, with a ``warning``.
@@ -214,7 +186,8 @@ class FakestereoNet:
                 None: all.
 
         Raises:
-            InputError: no such weights, no matcher in them, or an ``answer`` that they cannot give.
+            InputError: no such weights, no matcher in them, an ``answer`` that they cannot give, or
+                arguments of which one would not be used.
         """
         # The weights that are named, as generator and matcher.
         if weights is None and matcher is None:
@@ -224,32 +197,47 @@ class FakestereoNet:
                 f"answer is {answer!r}, and a matcher alone estimates no single image; give the "
                 "weights of a generator, or omit answer"
             )
-        loaded = None
-        loaded_matcher = None
-        loaded_files: list[tuple[str, DepthWeights]] = []
+        networks_by_name: dict[str, DepthWeights] = {}
+        generator = None
         if weights is not None:
-            loaded = read_depth_weights(find_weights(weights), use=use, answer=answer)
-            loaded_files.append((str(weights), loaded))
+            networks = read_depth_weights(find_weights(weights), use=use, answer=answer)
+            networks_by_name[str(weights)] = networks
+            generator = networks.generator
+            if generator is None and matcher is not None:
+                raise InputError(
+                    f"weights is {str(weights)!r} and matcher is given too, so nothing of these "
+                    "weights would run. Omit one of the two."
+                )
         # A Path has a method 'match', so it would pass for a matcher: it is recognised first.
         if isinstance(matcher, str | Path) and matcher != "sgbm":
-            loaded_matcher = read_depth_weights(find_weights(matcher), use="pairs")
-            loaded_files.append((str(matcher), loaded_matcher))
-        terms = join_terms(*(networks.facts for _, networks in loaded_files))
+            networks_by_name[str(matcher)] = read_depth_weights(find_weights(matcher), use="pairs")
+        terms = join_terms(*(networks.facts for networks in networks_by_name.values()))
         warn_of_terms({"terms": terms})
 
-        # The networks that run, in place of the defaults as the caller chose.
-        generator = None if loaded is None else loaded.generator
-        chosen_matcher = _choose_matcher(weights, loaded, matcher, loaded_matcher, config)
+        # The matcher that runs: OpenCV's, the caller's, or that of the weights that are named last.
+        config = config or MatcherConfig()
+        if matcher == "sgbm":
+            matcher = SGBMMatcher()
+        if isinstance(matcher, str | Path | None):
+            *_, networks = networks_by_name.values()
+            has_own_answer = generator is not None and generator.config.answer == "own"
+            if networks.matcher is not None:
+                chosen_matcher = make_matcher(networks.matcher, config)
+            elif matcher is None and has_own_answer:
+                chosen_matcher = None
+            else:
+                raise _no_matcher_error(weights, matcher)
+        else:
+            _refuse_unused_settings(config, matcher)
+            chosen_matcher = matcher
         synthesiser = None
         if generator is not None:
-            run_config = config if isinstance(config, MatcherConfig) else MatcherConfig()
-            synthesiser = make_synthesiser(generator, run_config.device, run_config.speed)
-        names = " + ".join(name for name, _ in loaded_files)
+            synthesiser = make_synthesiser(generator, config.device, config.speed)
         return cls(
             chosen_matcher,
             synthesiser,
             terms=terms,
-            weights=names,
+            weights=" + ".join(networks_by_name),
             allow_ood=allow_ood,
             with_check=with_check,
         )
@@ -285,9 +273,9 @@ class FakestereoNet:
             fov_deg: the horizontal field of view alone [degrees], in place of both.
             right: right image, the same size and rows.
             known_distance: column, row [px] and camera z [m] of a measured point, which sets the
-                scale of one image.
-            mount: the same for all frames of one camera on one vehicle, taken in order: holds its
-                height and smooths its tilt.
+                scale of one image, not of a pair.
+            mount: of one image, the same for all frames of one camera on one vehicle, taken in
+                order: holds its height and smooths its tilt.
             name: name of the input in errors; by default that of the file.
 
         Raises:
@@ -471,9 +459,15 @@ class FakestereoNet:
         """Correct the depth of a single image by the mount of its camera; a pair stays as it is.
 
         Raises:
-            InputError: the camera states a mount that the image contradicts.
+            InputError: the camera states a mount that the image contradicts, or a pair is one of
+                the frames of a mount.
         """
         if estimate.input.right is not None:
+            if mount is not None:
+                raise InputError(
+                    f"{estimate.input.name}: a pair has metres of its own; omit mount, or the "
+                    "right image"
+                )
             return estimate
         synthesiser = self._require_synthesiser(estimate.input.name)
         return scale_by_mount(estimate, mount, synthesiser.config)

@@ -326,8 +326,9 @@ class LightMatcher(NetworkMatcher):
         check_views(left, right)
         measured = measure_disparity_range(self, left, right, infinity_px(camera))
         search = choose_search_range(self, measured, left.shape[1:], camera)
-        match = self.match_within(left, right, search, camera)
-        if not self.config.with_left_right_check:
+        with_check = self.config.with_left_right_check
+        match = self.match_within(left, right, search, camera, with_left_right_check=with_check)
+        if not with_check:
             match = doubt_hidden(match, measured)
         return doubt_outside(match, measured, search, self.config.max_disparity_px)
 

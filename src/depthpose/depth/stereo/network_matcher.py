@@ -21,7 +21,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth import disparity
 from depthpose.depth.config import MatcherConfig, NetworkConfig
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.stereo.matcher import Matcher, check_views, match_from_infinity
+from depthpose.depth.stereo.matcher import Matcher, match_from_infinity
 from depthpose.depth.types import Map, Maps, Match, View, Views
 
 STEP_PX = 4
@@ -146,7 +146,13 @@ class NetworkMatcher(ABC):
 
     @torch.no_grad()
     def match_within(
-        self, left: Tensor, right: Tensor, search: SearchRange, camera: Camera | None = None
+        self,
+        left: Tensor,
+        right: Tensor,
+        search: SearchRange,
+        camera: Camera | None = None,
+        *,
+        with_left_right_check: bool = False,
     ) -> Match:
         """Match one pair at the size and within the disparities of a search.
 
@@ -155,14 +161,15 @@ class NetworkMatcher(ABC):
             right: right image, the same size.
             search: size and disparities.
             camera: camera of the left image; with one, pixels become square.
+            with_left_right_check: match the mirrored pair too, and lower the confidence where both
+                disagree.
 
         Returns:
             The match, at the size and on the device of ``left``.
 
         Raises:
-            InputError: as :meth:`match`.
+            InputError: a memory bound that is too small for the images.
         """
-        check_views(left, right)
         height, width = left.shape[1:]
         size = self._scale_size((height, width), search.scale, camera)
         left_view, right_view = (
@@ -170,7 +177,7 @@ class NetworkMatcher(ABC):
             for view in (left, right)
         )
         match = self._match_padded(left_view, right_view, search)
-        if self.config.with_left_right_check:
+        if with_left_right_check:
             # Mirrored, the right view is a left one.
             mirrored = self._match_padded(right_view.flip(-1), left_view.flip(-1), search)
             match = lower_where_disagreeing(match, mirrored.disparity_px.flip(-1))
@@ -269,7 +276,8 @@ def match_in_usual_range(
 ) -> Match:
     """Match a pair within the usual search of its camera, without measuring its disparities.
 
-    So views are matched that a network synthesised, and pairs in exported graphs.
+    So views are matched that a network synthesised, and pairs in exported graphs. Images are not
+    checked by networks.
 
     Args:
         matcher: a network's; any other matches in its own way.
@@ -283,7 +291,8 @@ def match_in_usual_range(
     if not isinstance(matcher, NetworkMatcher):
         return matcher.match(left, right, camera)
     search = matcher.usual_search(left.shape[1:], camera)
-    return matcher.match_within(left, right, search, camera)
+    with_check = matcher.config.with_left_right_check
+    return matcher.match_within(left, right, search, camera, with_left_right_check=with_check)
 
 
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
@@ -326,10 +335,9 @@ def lower_where_disagreeing(
         tolerance_px: a difference up to this counts as none.
         decay_px: difference beyond the tolerance at which the agreement falls to 1/e.
     """
-    # Disparities at the matching points: NaN outside the right view.
-    matched_px = disparity.warp_right_to_left(right_px[None], match.disparity_px)[0]
-    difference_px = ((match.disparity_px - matched_px).abs() - tolerance_px).clamp(min=0)
-    agreement = torch.exp(-difference_px / decay_px).nan_to_num(0.0)
+    difference_px = disparity.left_right_difference(match.disparity_px, right_px)
+    beyond_px = (difference_px - tolerance_px).clamp(min=0)
+    agreement = torch.exp(-beyond_px / decay_px).nan_to_num(0.0)  # NaN outside the right view
     if match.confidence is None:
         return replace(match, confidence=agreement)
     confidence = match.confidence * (1 + agreement) / 2

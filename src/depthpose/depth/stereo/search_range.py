@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
-from depthpose.depth.disparity import matched_blankness, warp_right_to_left
+from depthpose.depth.disparity import left_right_difference, matched_blankness
 from depthpose.depth.stereo.network_matcher import (
     STEP_PX,
     NetworkMatcher,
@@ -76,7 +76,7 @@ def measure_disparity_range(
     # often in one view alone, so there the views need not agree. Borders without a picture match
     # each other at any disparity.
     is_picture = _find_picture_pixels(left, right, left_px)
-    is_agreed = is_picture & _find_agreeing_pixels(left_px, right_px, step_px)
+    is_agreed = is_picture & (left_right_difference(left_px, right_px) <= step_px)
     is_sure = is_picture & _find_sure_pixels(match)
 
     low_px, high_px = _find_ends(left_px, is_agreed, is_sure, search.scale)
@@ -114,12 +114,6 @@ def _find_picture_pixels(left: Tensor, right: Tensor, disparity_px: Map) -> Mask
     """Find the left pixels of which neither they nor their matches lie in a blank border."""
     left_blank = find_blank_borders(left).to(disparity_px.device)
     return ~left_blank & ~(matched_blankness(right, disparity_px) > 0)
-
-
-def _find_agreeing_pixels(left_px: Map, right_px: Map, tolerance_px: float) -> Mask:
-    """Find the left pixels that have the disparity of the right pixels that they match."""
-    matched_px = warp_right_to_left(right_px[None], left_px)[0]
-    return (left_px - matched_px).abs() <= tolerance_px
 
 
 def _find_sure_pixels(match: Match) -> Mask:

@@ -11,9 +11,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
+from depthpose.core.arrays import grey_from_rgb
 from depthpose.core.camera import StereoRig
 from depthpose.core.camera.pinhole import intrinsics
-from depthpose.core.camera.rectified import grey_from_rgb
 from depthpose.core.errors import InputError
 from depthpose.depth.config import NearConfig, StreetsConfig
 from depthpose.depth.synthetic.dataset import SyntheticFrame, render_scene

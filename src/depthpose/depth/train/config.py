@@ -12,7 +12,7 @@ from depthpose.depth.config import (
     PairsConfig,
     SelectionConfig,
 )
-from depthpose.depth.losses import ADVERSARIAL_LOSSES, GENERATOR_DISPARITY_LOSSES
+from depthpose.depth.losses import ADVERSARIAL_LOSSES
 from depthpose.depth.weights import MATCHERS
 
 
@@ -63,29 +63,45 @@ class ViewTraining(TrainingConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SelectTraining(TrainingConfig):
-    """Stage 1 of the generator that selects, in place of :class:`ViewTraining`."""
+class EncoderTraining(TrainingConfig):
+    """What the trainings have whose network may begin with an encoder of ImageNet."""
 
     WEIGHTS_SETTINGS: ClassVar[tuple[str, ...]] = ("start", "encoder")
 
-    generator: SelectionConfig = field(default_factory=SelectionConfig)
-    """The network that is trained."""
+    start: str | None = None
+    """Weights of the whole network to begin with (or a whole set)."""
 
     encoder: str | None = None
-    """Weights of the encoder to begin with ('depthpose weights import efficientnet-lite0')."""
-
-    start: str | None = None
-    """Weights of the whole generator to begin with (or a whole set)."""
+    """Weights of the encoder to begin with ('depthpose weights import efficientnet-lite0'); of
+    matchers only the light one has an encoder."""
 
     with_frozen_stem: bool = True
     """Keep the encoder's first layers and its batch norm statistics: right for ImageNet's weights,
     wrong for an encoder that begins at random."""
 
     encoder_rate: Annotated[float, "[0, 1]"] = 0.3
-    """Learning rate of the encoder as a share of the decoder's."""
+    """Learning rate of the encoder as a share of the rest's."""
 
-    disparity_loss: str = "log"
-    """log: error of disparity's logarithm; see ``losses.GENERATOR_DISPARITY_LOSSES``."""
+    def refuse_frozen_random(self) -> None:
+        """Refuse to freeze the first layers of an encoder that begins with random weights.
+
+        Raises:
+            InputError: ``with_frozen_stem`` is set, and neither ``encoder`` nor ``start``.
+        """
+        if self.with_frozen_stem and self.encoder is None and self.start is None:
+            raise InputError(
+                "with_frozen_stem keeps the encoder's first layers as they are, and nothing says "
+                "what they begin with: give --encoder ('depthpose weights import "
+                "efficientnet-lite0'), --start, or with_frozen_stem: false with encoder_rate: 1.0."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectTraining(EncoderTraining):
+    """Stage 1 of the generator that selects, in place of :class:`ViewTraining`."""
+
+    generator: SelectionConfig = field(default_factory=SelectionConfig)
+    """The network that is trained."""
 
     plane_weight: Annotated[float, "[0, inf)"] = 0.2
     """Weight of the cross entropy over sky and disparities."""
@@ -128,7 +144,6 @@ class SelectTraining(TrainingConfig):
     """Length, batches, seed and precision of the training."""
 
     def __post_init__(self) -> None:
-        refuse_unknown("disparity_loss", self.disparity_loss, GENERATOR_DISPARITY_LOSSES)
         super().__post_init__()
         for pairs in (self.pairs, self.more):
             if pairs is None:
@@ -142,10 +157,8 @@ class SelectTraining(TrainingConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StereoTraining(TrainingConfig):
+class StereoTraining(EncoderTraining):
     """Stage 2: the matcher learns disparity from pairs with truth (thesis, 2.4.2)."""
-
-    WEIGHTS_SETTINGS: ClassVar[tuple[str, ...]] = ("start", "encoder")
 
     kind: str = "psmnet"
     """The network that is trained, by its name in ``depth.weights.MATCHERS``: psmnet, light."""
@@ -154,23 +167,9 @@ class StereoTraining(TrainingConfig):
     """Settings of the network, those of the config of its kind; others have their defaults, which
     are filled in. To take another kind, give both anew."""
 
-    start: str | None = None
-    """Weights of the whole network to begin with (or a whole set)."""
-
-    encoder: str | None = None
-    """light: weights of the encoder to begin with ('depthpose weights import
-    efficientnet-lite0')."""
-
-    with_frozen_stem: bool = True
-    """light: keep the encoder's first layers and its batch norm statistics: right for ImageNet's
-    weights, wrong for an encoder that begins at random."""
-
     with_frozen_norms: bool = False
     """Keep the statistics of every batch norm, the encoder's and the rest's: right for a few steps
     of small batches from trained weights."""
-
-    encoder_rate: Annotated[float, "[0, 1]"] = 0.3
-    """light: learning rate of the encoder as a share of the rest's."""
 
     sky_weight: Annotated[float, "[0, 1]"] = 0.0
     """Weight of the sky; 0 leaves it out. It is taught a disparity of 0, each pixel with so much
@@ -211,7 +210,7 @@ class StereoTraining(TrainingConfig):
 
     def _refuse_unlearnt_sky(self) -> None:
         """Refuse a class of the sky without weight, and training one that is not there."""
-        has_sky = bool(getattr(self.network_config, "with_sky", False))
+        has_sky = self.network_config.with_sky
         if has_sky and self.sky_weight == 0:
             raise InputError(
                 "with_sky is true and sky_weight 0, so the sky would not be learnt; set sky_weight "

@@ -72,6 +72,8 @@ class TrainingPairs:
         self._refs: list[_PairRef] = []
         for refs in _list_pairs(config, needs_truth=needs_truth, is_mixed=is_mixed):
             self._refs += _spread_evenly(refs, config.limit)
+        if not self._refs:
+            raise InputError("streets.frames is 0, so there is no pair; give 1 or more streets.")
 
         # The frames on disk, and the truth of each source.
         self.frames: list[FramePaths] = []

@@ -45,20 +45,6 @@ _ADDABLE = ("with_sky",)
 further with them."""
 
 
-def refuse_frozen_random(config: SelectTraining | StereoTraining) -> None:
-    """Refuse to freeze the first layers of an encoder that begins with random weights.
-
-    Raises:
-        InputError: ``with_frozen_stem`` is set, and neither ``encoder`` nor ``start``.
-    """
-    if config.with_frozen_stem and config.encoder is None and config.start is None:
-        raise InputError(
-            "with_frozen_stem keeps the encoder's first layers as they are, and nothing says what "
-            "they begin with: give --encoder ('depthpose weights import efficientnet-lite0'), "
-            "--start, or with_frozen_stem: false with encoder_rate: 1.0."
-        )
-
-
 def copy_start(network: Generator | StereoNetwork, loaded: nn.Module, source: str) -> None:
     """Copy the weights that a training begins with into the network that it trains.
 
@@ -96,7 +82,7 @@ def make_matcher_network(config: StereoTraining) -> StereoNetwork:
             )
         load_encoder(matcher.encoder, find_weights(config.encoder))
     if matcher.encoder is not None:
-        refuse_frozen_random(config)
+        config.refuse_frozen_random()
     if config.start is not None:
         copy_start(matcher, read_matcher(find_weights(config.start)), config.start)
     return matcher
@@ -143,7 +129,7 @@ def train_view(config: ViewTraining, run: TrainingRun) -> Path:
 @releases_folder
 def train_select(config: SelectTraining, run: TrainingRun) -> Path:
     """Train the generator that selects; return the path of its weights."""
-    refuse_frozen_random(config)
+    config.refuse_frozen_random()
     torch.manual_seed(config.loop.seed)
     rig = config.generator
     seed = config.loop.seed

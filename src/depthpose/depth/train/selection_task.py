@@ -159,8 +159,8 @@ class SelectTask:
         half_log_px, _, _ = synthesis.read_logits(logits, planes)
         size = truth_px.shape[1:]
         log_px = F.interpolate(half_log_px[:, None], size, mode="bilinear", align_corners=False)
-        disparity_loss = losses.GENERATOR_DISPARITY_LOSSES[self.config.disparity_loss]
-        loss = disparity_loss(log_px[:, 0], truth_px, self.generator.config.disparity_px)
+        range_px = self.generator.config.disparity_px
+        loss = losses.log_disparity_loss(log_px[:, 0], truth_px, range_px)
         if not self.config.plane_weight:
             return loss
 

@@ -1,7 +1,7 @@
 """Reading of camera files of any known format, and writing of depthpose's own JSON.
 
 Formats of plain text are read here, JSON by ``camera_json``, files of ROS, OpenCV and ORB-SLAM by
-``stored_camera``. Each gives :class:`CameraFacts`, which ``camera_facts`` checks.
+``camera_fields``. Each gives :class:`CameraFacts`, which ``facts`` checks.
 """
 
 import re
@@ -14,7 +14,18 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from depthpose.core.camera.camera_facts import (
+from depthpose.core.camera.formats.camera_fields import (
+    facts_from_fields,
+    facts_from_folder,
+    parse_storage,
+)
+from depthpose.core.camera.formats.camera_json import (
+    DOFFS_KEY,
+    facts_from_json,
+    read_size,
+    with_json_keys,
+)
+from depthpose.core.camera.formats.facts import (
     KNOWN_FILES,
     SAME_DIFFERENCE_PX,
     CameraFacts,
@@ -23,19 +34,8 @@ from depthpose.core.camera.camera_facts import (
     facts_from_projections,
     refuse_unequal_cameras,
 )
-from depthpose.core.camera.camera_json import (
-    DOFFS_KEY,
-    facts_from_json,
-    read_size,
-    with_json_keys,
-)
 from depthpose.core.camera.lens import is_fisheye_lens
 from depthpose.core.camera.pinhole import Camera, Size, StereoRig, intrinsics
-from depthpose.core.camera.stored_camera import (
-    facts_from_fields,
-    facts_from_folder,
-    parse_storage,
-)
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_json, read_key_values, read_text, write_json
 from depthpose.core.files.disk import MAX_LIST_BYTES
@@ -87,8 +87,8 @@ _BARE_NUMBERS = 20  # numbers that are read of a file of bare numbers: more than
 def _read_middlebury(path: AnyPath) -> CameraFacts:
     """Read Middlebury's ``calib.txt``: cam0, doffs, baseline [mm], size; cam1 is only checked."""
     keys = read_key_values(path)
-    K = read_kitti_matrix(path, keys, "cam0", (3, 3))
-    right = read_kitti_matrix(path, keys, "cam1", (3, 3)) if "cam1" in keys else K
+    K = read_matrix(path, keys, "cam0", (3, 3))
+    right = read_matrix(path, keys, "cam1", (3, 3)) if "cam1" in keys else K
     baseline_mm, doffs_px = (_read_number(path, keys, name) for name in ("baseline", "doffs"))
 
     refuse_unequal_cameras(K, right)
@@ -141,7 +141,7 @@ def facts_from_lines(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFa
     )
 
 
-def read_kitti_matrix(
+def read_matrix(
     path: AnyPath, keys: Mapping[str, list[float]], name: str, shape: tuple[int, int]
 ) -> Matrix:
     """Read a matrix from the ``KEY: numbers`` lines of a calibration, such as KITTI's.
@@ -168,7 +168,7 @@ def read_kitti_matrix(
 def choose_kitti_pair(keys: Mapping[str, list[float]], pairs: Sequence[KittiPair]) -> KittiPair:
     """Choose the first of some pairs whose left projection a calibration has, else the first.
 
-    If the calibration has none of them, :func:`read_kitti_matrix` then raises the error that names
+    If the calibration has none of them, :func:`read_matrix` then raises the error that names
     the missing projection.
     """
     return next((pair for pair in pairs if pair.left in keys), pairs[0])
@@ -383,7 +383,7 @@ def _read_kitti(path: AnyPath) -> CameraFacts:
     """Read KITTI's colour pair (cameras 2 and 3), else its grey pair; or the left camera alone."""
     keys = read_key_values(path)
     pair = choose_kitti_pair(keys, (*KITTI_COLOR, *KITTI_GREY))
-    left_P = read_kitti_matrix(path, keys, pair.left, (3, 4))
-    right_P = read_kitti_matrix(path, keys, pair.right, (3, 4)) if pair.right in keys else None
+    left_P = read_matrix(path, keys, pair.left, (3, 4))
+    right_P = read_matrix(path, keys, pair.right, (3, 4)) if pair.right in keys else None
     size = read_kitti_size(keys, pair)
     return facts_from_projections("a KITTI calibration", left_P, right_P, size)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import yaml
 
-from depthpose.core.camera.camera_facts import KNOWN_FILES, CameraFacts, facts_from_projections
+from depthpose.core.camera.formats.facts import KNOWN_FILES, CameraFacts, facts_from_projections
 from depthpose.core.camera.lens import is_fisheye_lens
 from depthpose.core.camera.pinhole import Size, intrinsics
 from depthpose.core.errors import InputError

@@ -38,6 +38,9 @@ class DepthPipeline:
     net: FakestereoNet  #: the estimator
     batch_size: int = 1  #: number of pictures in one call of its networks
 
+    def __post_init__(self) -> None:
+        _refuse_batch_size(self.batch_size)
+
     def __call__(
         self,
         inputs: AnyPicture | Iterable[AnyPicture] | None = None,
@@ -69,15 +72,17 @@ class DepthPipeline:
             A list of pictures gives a list, another iterable an iterator.
 
         Raises:
-            InputError: as :meth:`FakestereoNet.estimate`.
+            InputError: as :meth:`FakestereoNet.estimate`; a ``batch_size`` below 1.
         """
         if (inputs is None) == (images is None):
             raise InputError("give the pictures, as the first argument or as images=")
         argument = images if inputs is None else inputs
         lens = choose_lens(camera, focal_px, fov_deg)
+        batch = self.batch_size if batch_size is None else batch_size
+        _refuse_batch_size(batch)
         is_single = isinstance(argument, str | Path | Image.Image | np.ndarray | Tensor)
         pictures = [argument] if is_single else cast("Iterable[AnyPicture]", argument)
-        estimates = self._estimate_each(pictures, lens, batch_size or self.batch_size, timeout)
+        estimates = self._estimate_each(pictures, lens, batch, timeout)
         if is_single:
             return next(estimates)
         return list(estimates) if isinstance(argument, list | tuple) else estimates
@@ -113,6 +118,12 @@ class DepthPipeline:
                 assert estimate.depth_m is not None
                 picture_of_depth = _draw_grey(estimate.depth_m)
                 yield {"predicted_depth": estimate.depth_m, "depth": picture_of_depth}
+
+
+def _refuse_batch_size(batch_size: int) -> None:
+    """Refuse a number of pictures below 1."""
+    if batch_size < 1:
+        raise InputError(f"pipeline: batch_size is {batch_size}; take 1 or more pictures")
 
 
 def _draw_grey(depth_m: Map) -> Image.Image:

@@ -8,10 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.camera.camera_facts import KNOWN_FILES, OPTIONAL_KEYS, CameraFacts
-from depthpose.core.camera.lens import is_fisheye_lens
-from depthpose.core.camera.pinhole import MAX_SIDE_PX, Size, intrinsics
-from depthpose.core.camera.stored_camera import (
+from depthpose.core.camera.formats.camera_fields import (
     Fields,
     facts_from_fields,
     find_distortion,
@@ -21,6 +18,9 @@ from depthpose.core.camera.stored_camera import (
     read_baseline_m,
     with_fisheye,
 )
+from depthpose.core.camera.formats.facts import KNOWN_FILES, OPTIONAL_KEYS, CameraFacts
+from depthpose.core.camera.lens import is_fisheye_lens
+from depthpose.core.camera.pinhole import MAX_SIDE_PX, Size, intrinsics
 from depthpose.core.errors import InputError, suggest_name
 
 DOFFS_KEY = "cx_right_minus_left_px"
