@@ -34,10 +34,6 @@ _SUPPRESSION_RAD = 0.25  # angle up to which a rotation is that of a better one
 _TEETH = range(13, 61)  # orders of which one step is tried: gears and knurls
 _TOOTH_CONTRAST = 0.004  # diameters by which a rotation between teeth must deviate more
 
-_TOLERANCE = 0.02
-_TOLERANCE_M = 0.005
-"""Usual tolerance of a symmetry, the less of a share of the diameter and metres: a long part has
-sides that are small beside its length."""
 _SURE = 0.5  # certainty from which a proposal is accepted: that of a deviation of the tolerance
 _MOST_GROUP = 2 * max(_TEETH)  # of a wheel whose sides are alike; an icosahedron has 60
 _SAME_STEPS = 0.4  # share of the smallest rotation up to which two rotations are the same
@@ -56,9 +52,7 @@ class SymmetryProposal(NamedTuple):
     certainty: float  #: 1 for an exact copy, 1/2 at the tolerance, toward 0 beyond
 
 
-def propose_symmetries(
-    model: ObjectModel, tolerance: float | None = None
-) -> list[SymmetryProposal]:
+def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[SymmetryProposal]:
     """Search for rotations that leave the shape as it is, each with a certainty.
 
     Every symmetry leaves the centre of the surface where it is. Rotations by 1/2 to 1/6 of the
@@ -70,14 +64,11 @@ def propose_symmetries(
 
     Args:
         model: the object.
-        tolerance: deviation in diameters at which the certainty is one half; None: 2 %, and 5 mm at
-            most.
+        tolerance: deviation in diameters at which the certainty is one half.
 
     Returns:
         Proposals of a certainty of 1/5 and more, continuous first, then the surest.
     """
-    if tolerance is None:
-        tolerance = min(_TOLERANCE, _TOLERANCE_M / model.diameter_m)
     surface = sample_deviation(model)
     proposals: list[SymmetryProposal] = []
     tried_axes: list[Tensor] = []
@@ -181,7 +172,7 @@ def _complete_group(turns: list[Rigid]) -> list[Rigid]:
     return group
 
 
-def with_found_symmetries(model: ObjectModel, tolerance: float | None = None) -> ObjectModel:
+def with_found_symmetries(model: ObjectModel, tolerance: float = 0.02) -> ObjectModel:
     """Search the symmetries of a model that declares none, and return it with those of its shape.
 
     They are searched once for each shape, and kept in ``$DEPTHPOSE_CACHE``. ``tolerance`` is that

@@ -78,6 +78,7 @@ class Observation:
     depth_m: np.ndarray  #: (h, w), NaN where there is no reading
     is_masked: bool  #: whether a mask says which pixels are of the object
     is_object: np.ndarray  #: (h, w) these pixels, without their border; none without a mask
+    leaves_image: bool  #: whether pixels of the object lie at the border of the image
     is_background: np.ndarray  #: (h, w) pixels whose readings lie on a known background
     K: Float64[Tensor, "3 3"]  #: intrinsic matrix of the window
     noise: DepthNoise  #: of readings on the object
@@ -160,6 +161,10 @@ def observe(
     else:
         depth_m = view.depth_m[top : top + height, left : left + width].double()
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, torch.nan)
+    leaves_image = False
+    if view is not None:
+        size = torch.tensor(view.depth_m.shape).flip(0)
+        leaves_image = bool(((pixel <= 0) | (pixel >= size - 1)).any())
     is_background = torch.zeros_like(is_object)
     if view is not None and view.background is not None:
         is_background = view.background.is_seen[top : top + height, left : left + width]
@@ -181,6 +186,7 @@ def observe(
         view=view,
         depth_m=np.ascontiguousarray(depth_m.float().numpy()[::step, ::step]),
         is_masked=is_masked,
+        leaves_image=leaves_image,
         is_object=np.ascontiguousarray(inner.numpy()[::step, ::step]) & is_masked,
         is_background=np.ascontiguousarray(is_background.numpy()[::step, ::step]),
         K=window_K,

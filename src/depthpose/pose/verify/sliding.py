@@ -1,8 +1,8 @@
 """A pose slid to where the image fits it best, along directions that its points do not fix.
 
-ICP compares points with the surface: a long profile may slide along itself while its points stay on
-it. Where it ends, and where its holes are, shows in the image alone: there the camera saw through
-the posed surface, or readings of the object lie beside it.
+ICP compares points with the surface: a long profile that runs out of the image may slide along
+itself while its points stay on it. Where it ends, and where its holes are, shows in the image
+alone: there the camera saw through the posed surface, or readings of the object lie beside it.
 """
 
 from dataclasses import replace
@@ -51,10 +51,11 @@ def slide(
         deviation, and the evidence of it; both as they were where no place is better, or where so
         much contradicts the pose that it is wrong in another way.
     """
-    # Without a mask nothing contradicts a pose that leaves readings of its object uncovered.
-    if not observation.is_masked or evidence.contradicted == 0:
+    # A part that is seen whole is held by its two ends. And without a mask nothing contradicts a
+    # pose that leaves readings of its object uncovered.
+    if not observation.leaves_image or not observation.is_masked:
         return fit, evidence
-    if evidence.agreement < LEAST_AGREEMENT:
+    if evidence.contradicted == 0 or evidence.agreement < LEAST_AGREEMENT:
         return fit, evidence
     for direction in _find_free_directions(fit.camera_from_model.double(), observation, surface):
         fit, evidence = _slide_along(direction, fit, evidence, observation, surface)
