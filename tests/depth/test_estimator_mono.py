@@ -811,3 +811,9 @@ def test_results_can_be_changed_in_place_and_pictures_be_of_any_byte_order() -> 
     torch.testing.assert_close(plain, other)
     plain[plain > 1.0] = 0.0
     assert float(plain.nan_to_num(0.0).max()) <= 1.0
+
+
+def test_settings_of_opencv_are_the_matcher_s() -> None:
+    config: Any = SGBMConfig()
+    with pytest.raises(InputError, match=r"config is a SGBMConfig.*give matcher=SGBMMatcher"):
+        FakestereoNet.load(matcher="sgbm", config=config)

@@ -8,7 +8,7 @@ import torch
 from tests.pose.synthetic_objects import K, boxes, view_of
 
 from depthpose import Registration
-from depthpose.core.rigid import Rigid, rotation_by
+from depthpose.core.rigid import Rigid, cross_matrix, rotation_by
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.icp import refine_exactly
 from depthpose.pose.metrics import add_m
@@ -68,8 +68,9 @@ def test_a_pose_slides_to_where_its_end_is_seen(shift_m: float) -> None:
     offset_m = slid.camera_from_model.t_m - truth.t_m
     assert float(offset_m.norm()) < 0.004
     assert evidence_there.contradicted < 0.1 * evidence.contradicted
-    deviation_m = float(slid.covariance[3, 3]) ** 0.5
-    assert float(offset_m.norm()) / 2 < deviation_m < 0.01
+    of_middle = torch.cat([-cross_matrix(observation.cloud_m.mean(0)), torch.eye(3).double()], 1)
+    covariance = of_middle @ slid.covariance.double() @ of_middle.mT
+    assert float(offset_m.norm()) / 2 < float(covariance[0, 0]) ** 0.5 < 0.01
 
 
 def test_a_pose_that_nothing_contradicts_stays_as_it_is() -> None:
@@ -86,9 +87,11 @@ def test_an_end_in_the_image_fixes_a_shift_that_no_point_does() -> None:
     fixed = find_fixed_shift(pose_of(-0.12), ALONG, with_end, angle().surface)
     assert fixed is not None
     assert 0 < fixed.deviation_m <= 0.05 * angle().surface.diameter_m
-    covariance = fixed.limit(torch.eye(6))
-    assert float(covariance[3, 3]) == pytest.approx(fixed.deviation_m**2)
-    assert float(covariance[4, 4]) == 1
+    # The middle of the points moves by v + w x c.
+    of_middle = torch.cat([-cross_matrix(fixed.middle_m), torch.eye(3).double()], 1)
+    covariance = of_middle @ fixed.set_deviation(torch.eye(6).double()) @ of_middle.mT
+    assert float(covariance[0, 0]) == pytest.approx(fixed.deviation_m**2)
+    assert float(covariance[1, 1]) > 1
 
     bar = boxes("bar", ((0.8, 0.05, 0.02), (0.0, 0.0, 0.0)))
     target = TargetObject(number=0, model=bar)

@@ -267,7 +267,7 @@ def _follow(
     weighed = _weigh_pose(observation, pose, current.log_odds, surface, config.limits)
     free = free_motions(target.model.symmetries.continuous, pose)
     fixed = require_observable(observation, target, pose, free, config.limits)
-    covariance = refined.covariance if fixed is None else fixed.limit(refined.covariance)
+    covariance = refined.covariance if fixed is None else fixed.set_deviation(refined.covariance)
 
     # The estimate, and the track that the next frame begins with.
     estimate = PoseEstimate(

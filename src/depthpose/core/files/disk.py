@@ -479,12 +479,12 @@ def write_json(path: AnyPath, value: object) -> None:
 def read_key_values(path: AnyPath) -> dict[str, list[float]]:
     """Read ``KEY: numbers`` lines, as of KITTI's calibrations: the numbers by key.
 
-    ``key=[a b; c d]``, as of Middlebury's, is read row by row. Keys of words alone, such as dates,
-    are left out, and so are blank lines and what follows ``#``.
+    ``key=[a b; c d]``, as of Middlebury's, is read row by row. Lines with words, such as dates, are
+    left out, and so are blank lines and what follows ``#``.
 
     Raises:
-        InputError: the file is missing or not text, a line has no key, repeats one or mixes numbers
-            and words, or a number is not finite.
+        InputError: the file is missing or not text, a line has no key or repeats one, a number is
+            mistyped or not finite.
     """
     keys: set[str] = set()  # of all lines, those of words too
     numbers_of_key: dict[str, list[float]] = {}
@@ -500,19 +500,23 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
             raise InputError(f"{path}: line {number} gives {key!r} again; keep one of them")
         keys.add(key)
 
-        # Numbers alone, or words alone.
+        # Numbers alone, or a text such as a date or a name.
         numbers: list[float] = []
         others: list[str] = []
-        for word in content.translate(_BRACKETS_TO_BLANKS).split():
+        words = content.translate(_BRACKETS_TO_BLANKS).split()
+        for word in words:
             try:
                 numbers.append(float(word))
             except ValueError:
                 others.append(word)
-        if numbers and others:
+        mistyped = [word for word in others if any(map(str.isdigit, word))]
+        if numbers and mistyped and words[0] not in others:
             raise InputError(
-                f"{path}: line {number}, {key!r}, mixes numbers and words ({others[0][:60]!r}); "
-                "correct the number, or put a # before the line"
+                f"{path}: line {number}, {key!r}, has {mistyped[0][:60]!r} among its numbers; "
+                "correct it, or put a # before the line"
             )
+        if others:
+            continue
         if not all(map(math.isfinite, numbers)):
             raise InputError(f"{path}: line {number}, {key!r}, holds NaN or infinity")
         if numbers:

@@ -189,6 +189,11 @@ class FakestereoNet:
             InputError: no such weights, no matcher in them, an ``answer`` that they cannot give, or
                 arguments of which one would not be used.
         """
+        if config is not None and not isinstance(config, MatcherConfig):
+            raise InputError(
+                f"config is a {type(config).__name__}, and load takes a MatcherConfig; give "
+                "matcher=SGBMMatcher(SGBMConfig(...)) for OpenCV's settings"
+            )
         # The weights that are named, as generator and matcher.
         if weights is None and matcher is None:
             weights = DEFAULT

@@ -44,7 +44,7 @@ class SurfaceDeviation:
         self._dense_points = take_evenly(self.points, 10_000)  # for exact measures
         self._normals = normals.double().numpy()
         self._tree = KDTree(self.points.numpy())
-        # About the largest distance of neighbours: that to the fourth one.
+        # Typical spacing of samples: the median distance to the fourth neighbour.
         neighbours, _ = self._tree.query(self.compared_points.numpy(), k=5)
         self._spacing = float(np.median(neighbours[:, 4]))
         self._rough_tree = KDTree(take_evenly(self.points, 2500).numpy())  # a fast, coarse one

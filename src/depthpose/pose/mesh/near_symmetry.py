@@ -20,10 +20,10 @@ from depthpose.pose.types import ObjectModel, Symmetries
 
 EXACT_DEVIATION = 0.004
 """Deviation in diameters up to which a symmetry that was found in a shape is exact: as much as a
-cylinder of 25 facets deviates. A copy that deviates by more, as a scan's dents or a keyway do, is
-another pose, though a view may not tell which."""
+cylinder of 25 facets deviates whose diameter is its length. A copy that deviates by more, as a
+scan's dents or a keyway do, is another pose, though a view may not tell which."""
 _EXACT_DEVIATION_M = 0.002
-"""The same in metres: a large part has details that are small beside its diameter."""
+"""The same in metres, of which the smaller counts: a large part has small details."""
 _NEAR_TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
@@ -81,7 +81,7 @@ def true_symmetries(model: ObjectModel) -> Symmetries:
     """Select the symmetries of a model whose copies count as one pose.
 
     These are all that were declared. Of those that were found in the geometry, near-symmetries,
-    whose copies deviate by more than ``EXACT_DEVIATION`` and 2 mm allow, are left out.
+    whose copies deviate by more than the smaller of ``EXACT_DEVIATION`` and 2 mm, are left out.
     """
     if not model.symmetries.is_found:
         return model.symmetries

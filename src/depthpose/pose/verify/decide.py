@@ -13,6 +13,7 @@ from torch.nn.functional import normalize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import OTHER_FRAME
 from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.refusals import Refused
 from depthpose.pose.types import Alternative, Evidence, Identity, PoseEstimate
 from depthpose.pose.verify.copies import describe_difference
@@ -34,6 +35,8 @@ _HIDDEN_WEIGHT = 0.5
 """Of an area that was not observed beside one that contradicts: it may only be hidden."""
 _LEAST_CONTRADICTING = LEAST_AREA / 4
 """Independent patches: a smaller area does not explain why a pose is doubted."""
+_LARGEST_ROTATION = 0.2
+"""Of a unit motion: with less it counts as a shift."""
 LEAST_NAMED = 0.005
 """Alternatives of a smaller probability are not named."""
 LEAST_SHARE = 0.8
@@ -84,7 +87,7 @@ def decide(
 
     covariance = best.refined.covariance
     if fixed is not None:
-        covariance = fixed.limit(covariance)
+        covariance = fixed.set_deviation(covariance)
     estimate = PoseEstimate(
         name="",
         object=model.name,
@@ -137,19 +140,38 @@ def require_observable(
     observable, weakest = observed
     if observable >= limits.min_observability:
         return None
-    motion = "rotation"
-    if float(weakest[:3].norm()) <= math.sqrt(0.5):
-        motion = "shift"
-        direction = normalize(weakest[3:], dim=0)
-        fixed = find_fixed_shift(pose, direction, observation, target.surface)
-        if fixed is not None:
-            return fixed
+    motion = "rotation" if float(weakest[:3].norm()) > math.sqrt(0.5) else "shift"
+    fixed = _find_fixed_shift(observation, target.surface, pose, free, weakest, limits)
+    if fixed is not None:
+        return fixed
     raise Refused(
         "not observable",
         f"the visible part of the object leaves one {motion} undetermined: it moves the "
         f"surface along its normals by {observable:.1%} of the motion only; no declared "
         "symmetry allows it. Declare the symmetry, or look from a side that shows more",
     )
+
+
+def _find_fixed_shift(
+    observation: Observation,
+    surface: Surface,
+    pose: Rigid,
+    free: Float[Tensor, "k 6"],
+    weakest: Float64[Tensor, "6"],
+    limits: RefusalConfig,
+) -> FixedShift | None:
+    """Find whether the weakest motion is a shift that the image determines, and the only weak one.
+
+    Arguments are those of :func:`require_observable`, and ``weakest`` that of ``observability``.
+    """
+    if float(weakest[:3].norm()) > _LARGEST_ROTATION:
+        return None
+    direction = normalize(weakest[3:], dim=0)
+    along = torch.cat([torch.zeros(3, dtype=torch.float64), direction])[None]
+    others = observability(observation.cloud_m, pose, surface, torch.cat([free.double(), along]))
+    if others is None or others[0] < limits.min_observability:
+        return None
+    return find_fixed_shift(pose, direction, observation, surface)
 
 
 def require_right(

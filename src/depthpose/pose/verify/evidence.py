@@ -78,7 +78,7 @@ class Observation:
     depth_m: np.ndarray  #: (h, w), NaN where there is no reading
     is_masked: bool  #: whether a mask says which pixels are of the object
     is_object: np.ndarray  #: (h, w) these pixels, without their border; none without a mask
-    leaves_image: bool  #: whether pixels of the object lie at the border of the image
+    leaves_image: bool  #: whether the mask reaches the border of the image
     is_background: np.ndarray  #: (h, w) pixels whose readings lie on a known background
     K: Float64[Tensor, "3 3"]  #: intrinsic matrix of the window
     noise: DepthNoise  #: of readings on the object
@@ -94,7 +94,8 @@ class Observation:
     def in_units_of(self, length_m: float) -> "Observation":
         """Measure all depths and deviations in another unit of length, as if it were a metre.
 
-        A model of its own size then looks as one ``length_m`` times as large does here.
+        A model of its own size then looks as one ``length_m`` times as large does here. ``view``
+        stays in metres.
         """
         noise = DepthNoise(
             white_std_m=self.noise.white_std_m / length_m,
@@ -163,8 +164,9 @@ def observe(
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, torch.nan)
     leaves_image = False
     if view is not None:
-        size = torch.tensor(view.depth_m.shape).flip(0)
-        leaves_image = bool(((pixel <= 0) | (pixel >= size - 1)).any())
+        mask = view.mask
+        borders = (mask[0], mask[-1], mask[:, 0], mask[:, -1])
+        leaves_image = any(bool(border.any()) for border in borders)
     is_background = torch.zeros_like(is_object)
     if view is not None and view.background is not None:
         is_background = view.background.is_seen[top : top + height, left : left + width]

@@ -111,7 +111,11 @@ def compete(
     # The winner's copies. Another of the different poses may be one too: one between two copies
     # about an axis. Together they have the shares of all of these.
     copy_fits = _refine_distinct_copies(cloud_m, winner.refined, target, config, view)
-    is_copy = _mark_copies(different, [winner.refined, *copy_fits], target)
+    copies = [hypothesize(fit) for fit in copy_fits]
+    if config.with_icp:
+        shares_with_winner = share_among_copies([winner, *copies], is_masked=is_masked)
+        copies = _slide_likely(copies, shares_with_winner[1:], target, observation)
+    is_copy = _mark_copies(different, [winner, *copies], target)
     joining = [
         hypothesis
         for hypothesis, joins in zip(different, is_copy, strict=True)
@@ -120,10 +124,6 @@ def compete(
     group_share = float(shares[torch.tensor(is_copy)].sum())
 
     # Second round: which of the copies is it? Each has its own colours.
-    copies = [hypothesize(fit) for fit in copy_fits]
-    if config.with_icp:
-        shares_with_winner = share_among_copies([winner, *copies], is_masked=is_masked)
-        copies = _slide_likely(copies, shares_with_winner[1:], target, observation)
     group = [winner, *copies, *joining]
     if view is not None:
         group = _with_own_color(group, target, view)
@@ -173,10 +173,10 @@ def _slide_likely(
 
 
 def _mark_copies(
-    hypotheses: Sequence[Hypothesis], copies: Sequence[PoseFit], target: TargetObject
+    hypotheses: Sequence[Hypothesis], copies: Sequence[Hypothesis], target: TargetObject
 ) -> list[bool]:
     """Mark the hypotheses at the pose of one of the copies, up to exact and near-symmetries."""
-    copy_poses = Rigid.stack([copy.camera_from_model.double() for copy in copies])
+    copy_poses = Rigid.stack([copy.pose for copy in copies])
     symmetries = _all_symmetries(target)
     return [
         bool(target.copies.is_same(hypothesis.pose, copy_poses, symmetries).any())

@@ -60,6 +60,8 @@ _SIZE_GAIN = 0.05
 """Least gain (:attr:`Scale.gain`) by which another size counts, 0.25 % of the diameter. With less
 the visible surface fits at many sizes, or the sensor errs: the right pose of a real bowl gains
 0.032 at 1.07."""
+_EQUAL_AGREEMENT = 0.05
+"""Difference of the shares that support two sizes up to which an image shows either as well."""
 _MIRROR_GAIN = 0.02
 """Gain from which a cloud is that of a mirrored copy, 0.1 % of the diameter. Right answers for
 synthetic views gained 0.004 at most, where the mirror image is not nearly the model."""
@@ -359,7 +361,7 @@ class _Fits(NamedTuple):
 
     name: str  #: of the model
     scale: Scale  #: that fits best
-    is_size_seen: bool  #: whether the image supports it as well as the own size
+    is_size_seen: bool  #: whether the image supports it as well as the model's size
     mirror_gain: float | None  #: None where the mirror image is the model itself
     size_tolerance: float  #: share by which a right object may seem to differ in size
     mirror_tolerance: float  #: gain of the mirror image that deviating sides explain
@@ -420,14 +422,15 @@ def _is_size_seen(
 ) -> bool:
     """Whether the image supports the model of another size as well as that of its own.
 
-    Points beside an object lie near a larger model too, beyond which the camera then sees.
+    The model is compared in a unit of length in which it has its own size. Points beside an object
+    lie near a larger model too, beyond which the camera then sees.
     """
     resized = compare(
         observation.in_units_of(scale.times),
         Rigid(scale.pose.R, scale.pose.t_m / scale.times),
         surface,
     )
-    return resized.agreement >= best.evidence.agreement
+    return resized.agreement >= best.evidence.agreement - _EQUAL_AGREEMENT
 
 
 def _explain_contradiction(fits: _Fits) -> str:
@@ -463,16 +466,16 @@ def _explain_unconfirmed(fits: _Fits, evidence: Evidence) -> str:
 
     # Is another size or the mirror image excluded?
     if size_error + deviation + fits.offset_error > _OTHER_SIZES:
-        return f"what was seen does not fix the size: {_describe_size(scale)}"
+        hidden = (
+            "" if fits.is_size_seen else ", but not the image: points beside the object hide it"
+        )
+        return f"what was seen does not fix the size: {_describe_size(scale)}{hidden}"
     if fits.mirror_gain is not None and fits.mirror_gain > -_MIRROR_GAIN:
         return f"the mirror image of {fits.name} fits what was seen as well"
 
     # And is it the model's own size, with nothing that contradicts it?
     if scale.gain > _SIZE_GAIN:
-        cause = "which a sensor's errors may explain"
-        if not fits.is_size_seen:
-            cause = "but not the image: points beside an object lie near a larger model too"
-        return f"{_describe_size(scale)}, {cause}"
+        return f"{_describe_size(scale)}, which a sensor's errors may explain"
     if size_error > max(_NEAR_SIZE, deviation) + fits.offset_error:
         return f"{_describe_size(scale)}, and not that of the model"
     contradicted = evidence.contradicted + evidence.continued

@@ -13,24 +13,25 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.types import Evidence, PoseFit
 from depthpose.pose.verify.evidence import Observation, compare
 from depthpose.pose.verify.probability import LEAST_AGREEMENT
 
 _POINTS = 1000  # of the cloud, by which directions are judged
-_LEAST_FIXED = 0.4
+_LEAST_NORMAL_RMS = 0.4
 """Root mean square component of the observed normals along a direction, from which the points fix
 the pose along it."""
 _COARSE_DIAMETERS = 0.025  # a coarse step
 _FINE_STEPS = 4  # fine steps in a coarse one
 _CLEARER_PATCHES = 1.0
-"""Independent patches by which a step must be better."""
+"""Independent patches by which the first step must be better."""
 _EQUAL_PATCHES = 0.5
 """Places that differ by less fit equally well."""
 _FIXED_DIAMETERS = (0.0125, 0.025, 0.05)
-"""Shifts by one of which an image that fixes a pose contradicts it."""
+"""Shifts that are tried, the smallest first: by one of them an image that fixes a pose contradicts
+it."""
 _FIXED_PATCHES = 1.0
 """Independent patches by which it contradicts the shifted pose more."""
 
@@ -48,7 +49,7 @@ def slide(
 
     Returns:
         The pose in the middle of the places that fit the image best, with their extent as its
-        deviation, and the evidence of it; both as they were where no place is better, or where so
+        deviation, and its evidence. Both are unchanged if no place is better by a patch, or if so
         much contradicts the pose that it is wrong in another way.
     """
     # A part that is seen whole is held by its two ends. And without a mask nothing contradicts a
@@ -76,7 +77,7 @@ def _find_free_directions(
     if len(normals) == 0:
         return []
     squares, directions = torch.linalg.eigh(normals.T @ normals / len(normals))
-    return [directions[:, k] for k in range(2) if float(squares[k]) < _LEAST_FIXED**2]
+    return [directions[:, k] for k in range(2) if float(squares[k]) < _LEAST_NORMAL_RMS**2]
 
 
 def _slide_along(
@@ -94,7 +95,7 @@ def _slide_along(
         return Rigid(pose.R, pose.t_m + shift_m * direction)
 
     def measure_misfit(shift_m: float) -> float:
-        """Measure how much of the shifted surface the image does not support, in patches."""
+        """Count the patches against the shifted pose, or where it was not observed."""
         shifted = compare(observation, shift(shift_m), surface)
         return shifted.contradicted + shifted.continued + shifted.unobserved
 
@@ -117,38 +118,51 @@ def _slide_along(
     # In fine steps about the best place. Edges are not compared: several places fit equally well.
     around = torch.linspace(-1, 1, 2 * _FINE_STEPS + 1).tolist()
     fine_m = [best_m + step * step_m for step in around]
-    fine = [measure_misfit(shift_m) for shift_m in fine_m]
-    most = min(fine) + _EQUAL_PATCHES
-    equal_m = [shift_m for shift_m, misfit in zip(fine_m, fine, strict=True) if misfit <= most]
-    middle_m = (equal_m[0] + equal_m[-1]) / 2
-    deviation_m = (equal_m[-1] - equal_m[0]) / 2 + step_m / _FINE_STEPS
+    misfits = [measure_misfit(shift_m) for shift_m in fine_m]
+    first = last = misfits.index(min(misfits))
+    most = min(misfits) + _EQUAL_PATCHES
+    while first > 0 and misfits[first - 1] <= most:
+        first -= 1
+    while last + 1 < len(misfits) and misfits[last + 1] <= most:
+        last += 1
+    fixed = FixedShift(
+        direction=direction,
+        middle_m=observation.cloud_m.mean(0),
+        deviation_m=(fine_m[last] - fine_m[first]) / 2 + step_m / _FINE_STEPS,
+    )
     slid = replace(
         fit,
-        camera_from_model=shift(middle_m),
-        covariance=_set_deviation(fit.covariance, direction, deviation_m),
+        camera_from_model=shift((fine_m[first] + fine_m[last]) / 2),
+        covariance=fixed.set_deviation(fit.covariance),
     )
     return slid, compare(observation, slid.camera_from_model, surface)
-
-
-def _set_deviation(
-    covariance: Float[Tensor, "6 6"], direction: Float64[Tensor, "3"], deviation_m: float
-) -> Float[Tensor, "6 6"]:
-    """Set the standard deviation of a pose's translation along a direction."""
-    along = torch.cat([torch.zeros(3, dtype=torch.float64), direction])
-    others = torch.eye(6, dtype=torch.float64) - torch.outer(along, along)
-    others_covariance = others @ covariance.double() @ others
-    return (others_covariance + deviation_m**2 * torch.outer(along, along)).to(covariance)
 
 
 class FixedShift(NamedTuple):
     """A shift of a pose that its points leave free, and the image does not."""
 
     direction: Float64[Tensor, "3"]  #: unit vector, in the camera frame
-    deviation_m: float  #: standard deviation of the pose along it
+    middle_m: Float64[Tensor, "3"]  #: of the points
+    deviation_m: float  #: standard deviation of the middle along the direction
 
-    def limit(self, covariance: Float[Tensor, "6 6"]) -> Float[Tensor, "6 6"]:
-        """Return the covariance of a pose with this deviation along the direction."""
-        return _set_deviation(covariance, self.direction, self.deviation_m)
+    def set_deviation(self, covariance: Float[Tensor, "6 6"]) -> Float[Tensor, "6 6"]:
+        """Return the covariance of a pose with this deviation of its middle.
+
+        ``covariance``: of (rotation, translation) about the camera, as that of a fit.
+        """
+        # About the middle c: v_camera = v_middle + c x rotation.
+        eye = torch.eye(6, dtype=torch.float64)
+        camera_from_middle = eye.clone()
+        camera_from_middle[3:, :3] = cross_matrix(self.middle_m)
+        middle_from_camera = eye.clone()
+        middle_from_camera[3:, :3] = -cross_matrix(self.middle_m)
+        about_middle = middle_from_camera @ covariance.double() @ middle_from_camera.mT
+
+        along = torch.cat([torch.zeros(3, dtype=torch.float64), self.direction])
+        others = eye - torch.outer(along, along)
+        about_middle = others @ about_middle @ others
+        about_middle += self.deviation_m**2 * torch.outer(along, along)
+        return (camera_from_middle @ about_middle @ camera_from_middle.mT).to(covariance)
 
 
 def find_fixed_shift(
@@ -163,7 +177,7 @@ def find_fixed_shift(
         surface: of the model.
 
     Returns:
-        The shift that the image contradicts either way; None where it does so for none.
+        The smallest shift that is tried and contradicted both ways; None if none is.
     """
 
     def count_contradicting(shift_m: float) -> float:
@@ -176,5 +190,5 @@ def find_fixed_shift(
     for diameters in _FIXED_DIAMETERS:
         shift_m = diameters * surface.diameter_m
         if min(count_contradicting(-shift_m), count_contradicting(shift_m)) >= limit:
-            return FixedShift(direction, shift_m)
+            return FixedShift(direction, observation.cloud_m.mean(0), shift_m)
     return None
