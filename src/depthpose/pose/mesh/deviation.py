@@ -13,7 +13,7 @@ from depthpose.core.rigid import Rigid, fit_rigid
 from depthpose.pose.mesh.models import sample_surface
 from depthpose.pose.types import ObjectModel
 
-EXACT_SHARE = 0.9995
+EXACT_SHARE = 0.999
 """Share of the surface within ``EXACT_DEVIATION``: a key or a notch is a few percent of it, a hole
 in a long profile two thousandths."""
 _USUAL_SHARE = 0.98  # of the points: the farthest of a scan are stray
