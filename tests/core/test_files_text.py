@@ -44,7 +44,8 @@ def test_text_loses_its_byte_order_mark(tmp_path: Path) -> None:
 
 def test_key_values_of_kitti_and_middlebury(tmp_path: Path) -> None:
     (tmp_path / "calib.txt").write_text(
-        "# sensors\ncalib_time: 09-Jan-2012 13:57:47\ncamera: ZED 2\ndate: 9 May 2024\n\nP2: 7.2e+02 0 -1\nP_rect_02: 1 2\r\n"
+        "# sensors\ncalib_time: 09-Jan-2012 13:57:47\ncamera: ZED 2\ndate: 9 May 2024\n\n"
+        "P2: 7.2e+02 0 -1\nP_rect_02: 1 2\r\n"
         "cam0=[3997.684 0 1176.728; 0 3997.684 1011.728; 0 0 1]\ndoffs=131.111\nR0_rect:\n"
     )
     assert read_key_values(tmp_path / "calib.txt") == {
