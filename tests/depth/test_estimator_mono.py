@@ -34,6 +34,7 @@ from depthpose.depth.config import (
 )
 from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
+from depthpose.depth.estimator.net import require_matcher_config
 from depthpose.depth.evaluate import measure_image_confidence
 from depthpose.depth.generators import SelectionGenerator, UNetGenerator
 from depthpose.depth.mount import MountFilter
@@ -814,6 +815,6 @@ def test_results_can_be_changed_in_place_and_pictures_be_of_any_byte_order() -> 
 
 
 def test_settings_of_opencv_are_the_matcher_s() -> None:
-    config: Any = SGBMConfig()
+    require_matcher_config(None)
     with pytest.raises(InputError, match=r"config is a SGBMConfig.*give matcher=SGBMMatcher"):
-        FakestereoNet.load(matcher="sgbm", config=config)
+        require_matcher_config(SGBMConfig())

@@ -76,6 +76,15 @@ def _no_matcher_error(weights: str | Path | None, matcher: str | Path | None) ->
     )
 
 
+def require_matcher_config(config: object) -> None:
+    """Raise an :class:`InputError` where a config is of something else than a matcher."""
+    if config is not None and not isinstance(config, MatcherConfig):
+        raise InputError(
+            f"config is a {type(config).__name__}, and load takes a MatcherConfig; give "
+            "matcher=SGBMMatcher(SGBMConfig(...)) for OpenCV's settings"
+        )
+
+
 def _refuse_unused_settings(config: MatcherConfig, matcher: Matcher) -> None:
     """Refuse settings of a match that a matcher without weights does not know.
 
@@ -189,11 +198,7 @@ class FakestereoNet:
             InputError: no such weights, no matcher in them, an ``answer`` that they cannot give, or
                 arguments of which one would not be used.
         """
-        if config is not None and not isinstance(config, MatcherConfig):
-            raise InputError(
-                f"config is a {type(config).__name__}, and load takes a MatcherConfig; give "
-                "matcher=SGBMMatcher(SGBMConfig(...)) for OpenCV's settings"
-            )
+        require_matcher_config(config)
         # The weights that are named, as generator and matcher.
         if weights is None and matcher is None:
             weights = DEFAULT
