@@ -147,6 +147,25 @@ def perturb(pose: Rigid, motion: Float[Tensor, "*batch 6"]) -> Rigid:
     return Rigid(rotation_by(motion[..., :3]), motion[..., 3:]) @ pose
 
 
+def move_reference(
+    covariance: Float64[Tensor, "*batch 6 6"], shift_m: Float64[Tensor, "3"]
+) -> Float64[Tensor, "*batch 6 6"]:
+    """Convert the covariance of a motion about a point to that of the same motion about another.
+
+    A rotation w about a point c with the translation v moves the origin by ``c x w + v``.
+
+    Args:
+        covariance: of (rotation vector [rad], translation [m]).
+        shift_m: from the new point to the old one, in the same axes.
+    """
+    eye = torch.eye(3, dtype=torch.float64)
+    zero = torch.zeros(3, 3, dtype=torch.float64)
+    rotation_rows = torch.cat([eye, zero], 1)
+    translation_rows = torch.cat([cross_matrix(shift_m), eye], 1)
+    new_from_old = torch.cat([rotation_rows, translation_rows])
+    return new_from_old @ covariance @ new_from_old.mT
+
+
 def rotation_by(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Make the rotation matrix of a rotation vector, axis times angle [rad].
 

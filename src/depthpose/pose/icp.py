@@ -12,7 +12,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, cross_matrix, rotation_by
+from depthpose.core.rigid import Rigid, move_reference, rotation_by
 from depthpose.pose.compiled import Vector, array_of, compiled, cross, dot, minus, rotate, vector
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.geometry.surface import (
@@ -264,13 +264,8 @@ def refine_exactly(
     offset_m = sensor_offset_m * torch.cat([torch.zeros(3), ray])
     covariance = covariance + torch.outer(offset_m, offset_m)
 
-    # The same about the camera: w x (p - c) + v = w x p + (v + c x w).
-    eye = torch.eye(3, dtype=torch.float64)
-    zero = torch.zeros(3, 3, dtype=torch.float64)
-    rotation_rows = torch.cat([eye, zero], 1)
-    translation_rows = torch.cat([cross_matrix(middle_m), eye], 1)
-    camera_from_middle = torch.cat([rotation_rows, translation_rows])
-    covariance = camera_from_middle @ covariance @ camera_from_middle.mT
+    # The same about the camera.
+    covariance = move_reference(covariance, middle_m)
     return PoseFit(
         camera_from_model=Rigid(refined.R.to(points_m), refined.t_m.to(points_m)),
         covariance=covariance.to(points_m),

@@ -259,7 +259,7 @@ _COMPARED_TURNS = 6  # approximate number of rotations by which places of an axi
 def _find_point_on_axis(
     turns: DeclaredTurns, surface: SurfaceDeviation, model: ObjectModel
 ) -> Float64[Tensor, "3"]:
-    """Find a point on an axis of some direction, such that the surface rotated about it fits best.
+    """Find a point of the axis, of given direction, about which the surface fits itself best.
 
     The axis is shifted from three starts, and the best of the three results is taken.
 

@@ -36,7 +36,7 @@ _HIDDEN_WEIGHT = 0.5
 _LEAST_CONTRADICTING = LEAST_AREA / 4
 """Independent patches: a smaller area does not explain why a pose is doubted."""
 _LARGEST_ROTATION = 0.2
-"""Of a unit motion: with less it counts as a shift."""
+"""Largest part of a unit motion that is rotation, where it counts as a shift."""
 LEAST_NAMED = 0.005
 """Alternatives of a smaller probability are not named."""
 LEAST_SHARE = 0.8
@@ -116,9 +116,8 @@ def require_observable(
 ) -> FixedShift | None:
     """Raise :class:`Refused` where a view leaves a motion beside the free ones undetermined.
 
-    The rotation about an axis of near-symmetry may stay undetermined: the copies about it are named
-    as alternatives. A shift that moves the surface within itself is determined where an end or a
-    hole is seen.
+    A shift that the image alone determines is returned. The rotation about an axis of
+    near-symmetry may stay undetermined: the copies about it are named as alternatives.
 
     Args:
         observation: of the object.
@@ -129,7 +128,8 @@ def require_observable(
         limits: the least share by which every other motion must move the visible surface.
 
     Returns:
-        A shift that the image determines alone; None where the points determine all.
+        The shift that an end or a hole in the image determines, and the points do not; None where
+        the points determine all motions.
     """
     near_axis = target.copies.near_axis
     if near_axis is not None:

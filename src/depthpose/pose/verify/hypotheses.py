@@ -161,14 +161,14 @@ def _slide_likely(
 ) -> list[Hypothesis]:
     """Slide the likely hypotheses to where the image fits them best; the others stay.
 
-    ``shares``: of the probability, of each.
+    ``shares``: the share of the probability that each hypothesis has.
     """
     slid = list(hypotheses)
     for k in shares.argsort(descending=True)[:_MOST_SLID].tolist():
         if float(shares[k]) >= _LEAST_SLID:
-            fit, evidence = slid[k].refined, slid[k].evidence
-            refined, evidence = slide(fit, evidence, observation, target.surface)
-            slid[k] = replace(slid[k], refined=refined, evidence=evidence)
+            likely = hypotheses[k]
+            refined, evidence = slide(likely.refined, likely.evidence, observation, target.surface)
+            slid[k] = replace(likely, refined=refined, evidence=evidence)
     return slid
 
 

@@ -420,7 +420,7 @@ def identify(
 def _is_size_seen(
     scale: Scale, best: Hypothesis, observation: Observation, surface: Surface
 ) -> bool:
-    """Whether the image supports the model of another size as well as that of its own.
+    """Whether the image supports the model of another size as well as the model of its own size.
 
     The model is compared in a unit of length in which it has its own size. Points beside an object
     lie near a larger model too, beyond which the camera then sees.

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.rigid import Rigid, cross_matrix
+from depthpose.core.rigid import Rigid, move_reference
 from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.types import Evidence, PoseFit
 from depthpose.pose.verify.evidence import Observation, compare
@@ -95,7 +95,7 @@ def _slide_along(
         return Rigid(pose.R, pose.t_m + shift_m * direction)
 
     def measure_misfit(shift_m: float) -> float:
-        """Count the patches against the shifted pose, or where it was not observed."""
+        """Add up the patches that contradict the shifted pose, or where it was not observed."""
         shifted = compare(observation, shift(shift_m), surface)
         return shifted.contradicted + shifted.continued + shifted.unobserved
 
@@ -150,19 +150,12 @@ class FixedShift(NamedTuple):
 
         ``covariance``: of (rotation, translation) about the camera, as that of a fit.
         """
-        # About the middle c: v_camera = v_middle + c x rotation.
-        eye = torch.eye(6, dtype=torch.float64)
-        camera_from_middle = eye.clone()
-        camera_from_middle[3:, :3] = cross_matrix(self.middle_m)
-        middle_from_camera = eye.clone()
-        middle_from_camera[3:, :3] = -cross_matrix(self.middle_m)
-        about_middle = middle_from_camera @ covariance.double() @ middle_from_camera.mT
-
         along = torch.cat([torch.zeros(3, dtype=torch.float64), self.direction])
-        others = eye - torch.outer(along, along)
-        about_middle = others @ about_middle @ others
-        about_middle += self.deviation_m**2 * torch.outer(along, along)
-        return (camera_from_middle @ about_middle @ camera_from_middle.mT).to(covariance)
+        variance_along = torch.outer(along, along)
+        others = torch.eye(6, dtype=torch.float64) - variance_along
+        about_middle = move_reference(covariance.double(), -self.middle_m)
+        about_middle = others @ about_middle @ others + self.deviation_m**2 * variance_along
+        return move_reference(about_middle, self.middle_m).to(covariance)
 
 
 def find_fixed_shift(
